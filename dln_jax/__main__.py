@@ -8,14 +8,14 @@ import os
 import sys
 from pathlib import Path
 
-from dln_jax.cli.commands import COMMANDS
+from dln_jax.commands import COMMANDS
 
 
 def command(name: str, prog: str) -> None:
     """Runs one command with the arguments of this process.
 
     Args:
-        name: name of a module in `dln_jax.cli.commands`.
+        name: name of a module in `dln_jax.commands`.
         prog: the command as the user typed it, for help and messages.
     """
     # Factorisations here are small, and OpenBLAS's threads spin while they wait: a step of 560 tetrahedra took 4 to 20
@@ -23,9 +23,9 @@ def command(name: str, prog: str) -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     sys.argv[0] = prog  # reports state the command that made them
     try:
-        from dln_jax.cli.running import run
+        from dln_jax.runs.running import run
 
-        module = importlib.import_module(f"dln_jax.cli.commands.{name}")
+        module = importlib.import_module(f"dln_jax.commands.{name}")
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         raise SystemExit(130) from None
@@ -66,7 +66,7 @@ def main() -> None:
 def first_line(name: str) -> str:
     """First line of a command's docstring."""
     # Parsed instead of imported: some commands take seconds to import.
-    specification = importlib.util.find_spec(f"dln_jax.cli.commands.{name}")
+    specification = importlib.util.find_spec(f"dln_jax.commands.{name}")
     source = Path(str(specification and specification.origin)).read_text(encoding="utf-8")
     return (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
 

@@ -21,9 +21,9 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from dln_jax.cli.running import as_one_line
 from dln_jax.errors import InputError
 from dln_jax.files import read_json, write_bytes
+from dln_jax.runs.running import as_one_line
 from scripts.reports.run import REMEDY, report
 
 NAMES = sorted(file.stem for file in Path(__file__).parent.glob("reports/cases/*.py"))

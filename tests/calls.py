@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from dln_jax.cli.running import run
+from dln_jax.runs.running import run
 from dln_jax.types import InputError
 
 

@@ -9,8 +9,8 @@ import pytest
 from calls import one_line
 from matplotlib.figure import Figure
 
-from dln_jax.cli import compilation_cache
 from dln_jax.files import cache_folder, matches, read_json, write_figure, write_json, writing
+from dln_jax.runs import compilation_cache
 from dln_jax.types import InputError
 
 

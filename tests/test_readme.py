@@ -16,10 +16,10 @@ from calls import command
 from conftest import PROGRAMS, SHORTEST_COMPILATION, slow_among
 from interpreters import Program, interpreters
 
-from dln_jax.cli.arguments import names_listed, parse
-from dln_jax.cli.commands import COMMANDS
-from dln_jax.cli.options import CompilationCache
+from dln_jax.commands import COMMANDS
 from dln_jax.data import schema
+from dln_jax.runs.arguments import names_listed, parse
+from dln_jax.runs.options import CompilationCache
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum
 from dln_jax.scenes.poles import cart_pole
@@ -61,7 +61,7 @@ def commands(text):
 
 def script_and_arguments(words):
     assert words[:2] == ["python", "-m"] and words[2].startswith("scripts."), words
-    return importlib.import_module(f"dln_jax.cli.commands.{words[2].removeprefix('scripts.')}"), words[3:]
+    return importlib.import_module(f"dln_jax.commands.{words[2].removeprefix('scripts.')}"), words[3:]
 
 
 def cases_and_line(words):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dln_jax.cli.commands import train_delan
+from dln_jax.commands import train_delan
 from dln_jax.data import schema
 from dln_jax.learning.engine.problem import Progress, Stop, Training
 from dln_jax.scenes.datasets import generators

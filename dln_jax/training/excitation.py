@@ -6,9 +6,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from dln_jax.cli.arguments import numbers_of
-from dln_jax.cli.progress import progress
-from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.data import schema
 from dln_jax.data.csv_tables import write_motion
 from dln_jax.data.robots import Robot, read_robot
@@ -23,6 +20,9 @@ from dln_jax.mechanics.trees.description import with_payload
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.runs.arguments import numbers_of
+from dln_jax.runs.progress import progress
+from dln_jax.runs.stored_arguments import command_folder
 from dln_jax.sizes import require_memory
 from dln_jax.training.results import print_numbers
 from dln_jax.types import InputError, require_positive

@@ -11,8 +11,6 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from dln_jax.cli.arguments import require_positive_if_given
-from dln_jax.cli.progress import progress
 from dln_jax.figures import style
 from dln_jax.figures.soft_body_animations import write_soft_body_gif
 from dln_jax.files import write_figure, write_json
@@ -21,6 +19,8 @@ from dln_jax.locomotion.learning import LANES, Goal, Record, evaluation_steps
 from dln_jax.locomotion.perturbed import numbers_of, perturbed_trials
 from dln_jax.locomotion.task import LocomotionTask, Walk, beginning, creature_named, make_task
 from dln_jax.locomotion.worlds import Variation
+from dln_jax.runs.arguments import require_positive_if_given
+from dln_jax.runs.progress import progress
 from dln_jax.scale.devices import device_lines
 from dln_jax.scale.mesh import shares
 from dln_jax.softbody.terms.creature import TIME_STEP, ground_height

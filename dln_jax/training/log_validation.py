@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.cli.arguments import names_listed, refuse_given
-from dln_jax.cli.encoders import facts
-from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.data.checks.validation import Examination, Recording, examine, read, report
 from dln_jax.data.robots import read_robot
 from dln_jax.data.splits import with_joints
 from dln_jax.figures.logs import log_figure
 from dln_jax.files import write_bytes, write_figure, write_json
+from dln_jax.runs.arguments import names_listed, refuse_given
+from dln_jax.runs.encoders import facts
+from dln_jax.runs.stored_arguments import command_folder
 from dln_jax.types import InputError
 
 

@@ -16,9 +16,9 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.cli.running import run
 from dln_jax.export.low_latency import enable_low_latency, low_latency
 from dln_jax.metrics.latency import one_step
+from dln_jax.runs.running import run
 from dln_jax.zoo.run import load
 
 ROOT = Path(__file__).parents[2]

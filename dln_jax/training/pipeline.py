@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 from jax.sharding import Mesh
 from matplotlib.figure import Figure
 
-from dln_jax.cli.scaled import mesh_of
-from dln_jax.cli.stored_arguments import command_folder, write_config
 from dln_jax.errors import FitRefused, InputError
 from dln_jax.files import write_figure, write_json
 from dln_jax.metrics.verdict import Verdict
 from dln_jax.models.model import Parameters
+from dln_jax.runs.scaled import mesh_of
+from dln_jax.runs.stored_arguments import command_folder, write_config
 from dln_jax.training.results import print_numbers
 from dln_jax.zoo.descriptions import Description
 from dln_jax.zoo.run import save

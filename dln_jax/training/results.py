@@ -7,10 +7,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Column, Table
 
-from dln_jax.cli.optimisers import name_of
 from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Progress, Training
 from dln_jax.metrics.latency import Latency
+from dln_jax.runs.optimisers import name_of
 
 OF_LOSSES = {"error": "loss", "loss": "training loss"}
 """Labels of a curve that shows losses."""

@@ -12,14 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.cli.arguments import resolved
-from dln_jax.cli.progress import progress
-from dln_jax.cli.stored_arguments import stored_arguments
 from dln_jax.figures.soft_bodies import Moments, moments_figure
 from dln_jax.files import write_figure, write_json
 from dln_jax.metrics.report import conditions, write_report
 from dln_jax.precision import data_type
 from dln_jax.rollout import rollout
+from dln_jax.runs.arguments import resolved
+from dln_jax.runs.progress import progress
+from dln_jax.runs.stored_arguments import stored_arguments
 from dln_jax.sizes import require_memory, require_within
 from dln_jax.softbody.driven import Example, drive, driven_step
 from dln_jax.softbody.examples import EXAMPLES

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.cli.arguments import names_listed, refuse_given
 from dln_jax.data import meshes
+from dln_jax.runs.arguments import names_listed, refuse_given
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.sets import values_by_set, vertices_in
 from dln_jax.softbody.mesh.surfaces import facet_points, facets_in, inner_surface

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax.sharding import Mesh
 
-from dln_jax.cli.arguments import names_listed, numbers_of, refuse_given, require_positive_if_given
-from dln_jax.cli.progress import progress
 from dln_jax.control.optimal.fitted import Iteration
 from dln_jax.control.optimal.plants import ValuePlant
 from dln_jax.files import finite
 from dln_jax.metrics.verdict import Verdict
 from dln_jax.precision import with_float64
+from dln_jax.runs.arguments import names_listed, numbers_of, refuse_given, require_positive_if_given
+from dln_jax.runs.progress import progress
 from dln_jax.training.pipeline import Fitted, Judged, Kind, png
 from dln_jax.training.value_figures import closed_loop, value_slice_of
 from dln_jax.training.value_plants import Chosen, Wishes, is_file_of_plant, of_file, of_run, published

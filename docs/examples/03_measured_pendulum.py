@@ -16,10 +16,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import dln_jax
-from dln_jax.cli.arguments import arguments_of
-from dln_jax.cli.commands import train_hnn_task
+from dln_jax.commands import train_hnn_task
 from dln_jax.figures import style
 from dln_jax.mechanics.integrators import rk4, rollout
+from dln_jax.runs.arguments import arguments_of
 
 jax.config.update("jax_enable_x64", True)
 

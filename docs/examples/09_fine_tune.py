@@ -17,10 +17,10 @@ import optax
 
 import dln_jax
 from dln_jax import dynamics
-from dln_jax.cli.arguments import arguments_of
-from dln_jax.cli.commands import train_delan
+from dln_jax.commands import train_delan
 from dln_jax.figures import style
 from dln_jax.mechanics.integrators import rk4, rollout, second_order
+from dln_jax.runs.arguments import arguments_of
 from dln_jax.scenes.datasets.generators import default_data
 from dln_jax.scenes.pendulums import LINK_LENGTH, two_link_arm
 

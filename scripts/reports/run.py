@@ -15,13 +15,13 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 
 import tyro
 
-from dln_jax.cli.arguments import names_listed
-from dln_jax.cli.options import Resumable
-from dln_jax.cli.running import run
-from dln_jax.cli.stored_arguments import command_folder
 from dln_jax.files import as_type, is_file, read_json, write_bytes, write_json
 from dln_jax.metrics.report import Row, conditions, write_report
 from dln_jax.precision import in_float64
+from dln_jax.runs.arguments import names_listed
+from dln_jax.runs.options import Resumable
+from dln_jax.runs.running import run
+from dln_jax.runs.stored_arguments import command_folder
 from dln_jax.types import InputError
 
 JOBS = "jobs.json"

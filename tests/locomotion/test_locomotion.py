@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from jax.sharding import Mesh
 from PIL import Image
 
-from dln_jax.cli.commands import train_locomotion
+from dln_jax.commands import train_locomotion
 from dln_jax.figures.soft_body_animations import write_soft_body_gif
 from dln_jax.locomotion import gradient
 from dln_jax.locomotion.environment import CreatureEnvironment

@@ -20,7 +20,7 @@ from motions import sums_of_sines
 from planar_arm import URDF
 
 import dln_jax
-from dln_jax.cli.commands import COMMANDS
+from dln_jax.commands import COMMANDS
 from dln_jax.data import schema
 from dln_jax.data.checks.validation import quick
 from dln_jax.data.splits import split
@@ -141,7 +141,7 @@ def masked(text):
 def ended(capsys, script, *words):
     """The exit status of a command, and what it prints."""
     try:
-        command(importlib.import_module(f"dln_jax.cli.commands.{script}"), *words)
+        command(importlib.import_module(f"dln_jax.commands.{script}"), *words)
         status = 0
     except SystemExit as end:
         status = end.code
@@ -202,7 +202,7 @@ def help_texts(capsys):
     found = {}
     for name in COMMANDS:
         try:
-            command(importlib.import_module(f"dln_jax.cli.commands.{name}"), "--help")
+            command(importlib.import_module(f"dln_jax.commands.{name}"), "--help")
         except SystemExit:
             found[name] = re.findall(r"--[a-z][\w-]*", capsys.readouterr().out)
     return found

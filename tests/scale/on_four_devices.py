@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from calls import one_line
 
-from dln_jax.cli.commands import __name__, __path__
+from dln_jax.commands import __name__, __path__
 from dln_jax.scale.devices import backend_started
 from dln_jax.scale.mesh import batch_mesh, on_devices, replicate, shard, shares, spread, total
 from dln_jax.scale.processes import host_devices

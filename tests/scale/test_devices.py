@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from dln_jax import compilation
-from dln_jax.cli.options import Scaled
-from dln_jax.cli.running import run
 from dln_jax.export.low_latency import enable_low_latency, low_latency
 from dln_jax.learning.engine.problem import Problem, require_finite_start
+from dln_jax.runs.options import Scaled
+from dln_jax.runs.running import run
 from dln_jax.scale import devices
 from dln_jax.types import InputError
 

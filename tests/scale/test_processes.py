@@ -21,11 +21,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.cli.options import Resumable, Scaled
-from dln_jax.cli.progress import progress
-from dln_jax.cli.running import run
-from dln_jax.cli.stored_arguments import command_folder
-from dln_jax.cli.scaled import mesh_of
+from dln_jax.runs.options import Resumable, Scaled
+from dln_jax.runs.progress import progress
+from dln_jax.runs.running import run
+from dln_jax.runs.stored_arguments import command_folder
+from dln_jax.runs.scaled import mesh_of
 from dln_jax.scale.mesh import of_first_process, shard, spread
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import load_tree, save_tree

@@ -12,7 +12,7 @@ from calls import assert_refused, command, one_line
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dln_jax.cli.commands import simulate
+from dln_jax.commands import simulate
 from dln_jax.softbody.mesh.files import read_mesh, write_mesh, write_motion
 from dln_jax.softbody.mesh.mesh import Mesh, NamedSet, boundary, components, make_mesh, volumes
 from dln_jax.softbody.mesh.sets import values_by_set, vertices_in

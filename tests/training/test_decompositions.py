@@ -11,13 +11,13 @@ from calls import command, json_of
 from motions import sums_of_sines
 
 from dln_jax import Needs
-from dln_jax.cli.arguments import arguments_of
-from dln_jax.cli.commands import train_delan
+from dln_jax.commands import train_delan
 from dln_jax.data import schema
 from dln_jax.data.schema import from_arrays
 from dln_jax.learning.gauges import summed_with_friction
 from dln_jax.mechanics import lagrangian
 from dln_jax.models.rigid_tree import USUAL
+from dln_jax.runs.arguments import arguments_of
 from dln_jax.scenes.datasets.generators import characters
 from dln_jax.training.dynamics.run import prepare
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from calls import one_line
 
-from dln_jax.cli.commands.simulate import Arguments
+from dln_jax.commands.simulate import Arguments
 from dln_jax.softbody.mesh.shapes import lattice
 from dln_jax.softbody.scene import make_scene, prepare
 from dln_jax.training.simulation import example_of

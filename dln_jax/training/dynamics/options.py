@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from dln_jax.cli.arguments import Unstated, Variants
-from dln_jax.cli.options import Devices, Drawn, Filtered, Limited, Resumable, Scaled, SingleCalls
+from dln_jax.runs.arguments import Unstated, Variants
+from dln_jax.runs.options import Devices, Drawn, Filtered, Limited, Resumable, Scaled, SingleCalls
 
 ActivationName = Literal["tanh", "softplus", "silu", "gelu", "sin", "cos"]
 Precision = Literal["f32", "f64"]

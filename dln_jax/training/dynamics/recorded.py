@@ -4,8 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dln_jax.cli.arguments import names_listed, refuse_given, require_positive_if_given
-from dln_jax.cli.encoders import facts, fitted_torque, needs_from_option, prepare_log, without_torque
 from dln_jax.data import schema
 from dln_jax.data.encoders.smoothing import labels_of_parts
 from dln_jax.data.repeated_motions import motion_numbers, remark_on_repeats
@@ -16,6 +14,8 @@ from dln_jax.data.stated_tests import is_cut, stated_test
 from dln_jax.files import read_json
 from dln_jax.learning.kinematics.frames import KinematicPrior, kinematic_prior_from_json
 from dln_jax.models.rigid_tree import USUAL
+from dln_jax.runs.arguments import names_listed, refuse_given, require_positive_if_given
+from dln_jax.runs.encoders import facts, fitted_torque, needs_from_option, prepare_log, without_torque
 from dln_jax.scenes.datasets.generators import CHARACTERS_TEST, default_data
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.scenes.registry import scene_named

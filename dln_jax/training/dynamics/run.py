@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax.sharding import Mesh
 
-from dln_jax.cli.optimisers import name_of
 from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
 from dln_jax.models.model import Model, Parameters
+from dln_jax.runs.optimisers import name_of
 from dln_jax.scale.devices import device_lines
 from dln_jax.time_limit import deadline
 from dln_jax.training.dynamics.options import NETWORK, model_of, network_option

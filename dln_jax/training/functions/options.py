@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from dln_jax.cli.arguments import Unstated, Variants, choice
-from dln_jax.cli.options import Drawn, Resumable, Scaled
+from dln_jax.runs.arguments import Unstated, Variants, choice
+from dln_jax.runs.options import Drawn, Resumable, Scaled
 
 NAMES = ("sin", "cos_sin")
 """Functions with the published noise."""

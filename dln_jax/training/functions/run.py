@@ -9,8 +9,6 @@ import numpy as np
 from jax.sharding import Mesh
 from matplotlib.figure import Figure
 
-from dln_jax.cli.optimisers import name_of
-from dln_jax.cli.progress import progress
 from dln_jax.data.functions import FunctionSamples, SampleSplit
 from dln_jax.figures import functions as drawing
 from dln_jax.figures.training import training_curve
@@ -26,6 +24,8 @@ from dln_jax.metrics.latency import one_step
 from dln_jax.metrics.verdict import Verdict, held_out, worst
 from dln_jax.metrics.verdict import judge as judge_columns
 from dln_jax.nn.activations import activation
+from dln_jax.runs.optimisers import name_of
+from dln_jax.runs.progress import progress
 from dln_jax.scale.devices import device_lines
 from dln_jax.training.functions.options import Options
 from dln_jax.training.functions.task import NAMED, Task, of_named, prepare

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from dln_jax.cli.arguments import Unstated, Variants, choice
-from dln_jax.cli.options import Checked, Drawn, Limited, Resumable, Scaled, SingleCalls
+from dln_jax.runs.arguments import Unstated, Variants, choice
+from dln_jax.runs.options import Checked, Drawn, Limited, Resumable, Scaled, SingleCalls
 
 REAL, MEASURED = "real-pendulum", "measured"
 GENERATED = (

@@ -14,8 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from dln_jax.cli.arguments import require_positive_if_given
-from dln_jax.cli.progress import progress
 from dln_jax.figures.animations import write_frame_gif
 from dln_jax.figures.phase_space import injection_figure
 from dln_jax.figures.style import TRUTH
@@ -47,6 +45,8 @@ from dln_jax.models.latent_phase import (
     through_components,
 )
 from dln_jax.models.model import Parameters
+from dln_jax.runs.arguments import require_positive_if_given
+from dln_jax.runs.progress import progress
 from dln_jax.scenes.datasets.pendulum_frames import (
     FRAME_TIME,
     FRAMES,

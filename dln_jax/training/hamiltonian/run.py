@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax.sharding import Mesh
 
-from dln_jax.cli.arguments import numbers_of, require_positive_if_given
-from dln_jax.cli.encoders import checked, facts, needs_from_option
-from dln_jax.cli.optimisers import optimiser_named
-from dln_jax.cli.progress import progress
 from dln_jax.compilation import in_background
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Progress
+from dln_jax.runs.arguments import numbers_of, require_positive_if_given
+from dln_jax.runs.encoders import checked, facts, needs_from_option
+from dln_jax.runs.optimisers import optimiser_named
+from dln_jax.runs.progress import progress
 from dln_jax.scale.devices import device_lines
 from dln_jax.time_limit import deadline, seconds_left
 from dln_jax.training.hamiltonian.model_selection import PAIRWISE, choose_model, description_of

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from dln_jax.cli.arguments import Unstated, choice
-from dln_jax.cli.options import Drawn, Filtered, Folder
+from dln_jax.runs.arguments import Unstated, choice
+from dln_jax.runs.options import Drawn, Filtered, Folder
 
 IDENTIFIED = ("viscous", "coulomb", "stribeck", "offset", "asymmetric", "sigmoid", "load")
 """Friction laws that can be identified; load only if cross-validation favours it."""

@@ -6,8 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.cli.arguments import names_in, names_listed, numbers_of, refuse_given, require_positive_if_given
-from dln_jax.cli.encoders import facts, fitted_torque, prepare_log, without_torque
 from dln_jax.data import schema
 from dln_jax.data.encoders.smoothing import labels_of_parts
 from dln_jax.data.repeated_motions import motion_numbers, remark_on_repeats
@@ -28,6 +26,8 @@ from dln_jax.learning.friction import FrictionFit, fit_friction
 from dln_jax.mechanics.friction.laws import FrictionShape, require_laws
 from dln_jax.mechanics.trees.description import tree_to_json
 from dln_jax.models.model import Parameters
+from dln_jax.runs.arguments import names_in, names_listed, numbers_of, refuse_given, require_positive_if_given
+from dln_jax.runs.encoders import facts, fitted_torque, prepare_log, without_torque
 from dln_jax.training.identification.motions import MotionSets, lightly_filtered
 from dln_jax.training.identification.options import IDENTIFIED, NO_FRICTION, Options
 from dln_jax.training.identification.terms import Wanted, at_reference, chosen, wanted

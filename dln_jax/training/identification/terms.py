@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from dln_jax.cli.arguments import names_listed, numbers_of
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.identification.base import DEPENDENT, unit_columns
@@ -18,6 +17,7 @@ from dln_jax.mechanics.friction.laws import FrictionShape
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.motors import Pair, require_motors
 from dln_jax.models.model import Model, Parameters
+from dln_jax.runs.arguments import names_listed, numbers_of
 from dln_jax.types import FrictionLaw, InputError
 
 

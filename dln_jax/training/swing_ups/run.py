@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.cli.progress import progress
 from dln_jax.control.closed_loop import ClosedLoopRun, Push, hanging_starts
 from dln_jax.control.desktop_plants import (
     NAMES,
@@ -34,6 +33,7 @@ from dln_jax.figures.closed_loops import MOST_SHOWN, closed_loop_traces
 from dln_jax.files import write_figure, write_json
 from dln_jax.learning.recordings import STEPS
 from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.runs.progress import progress
 from dln_jax.sizes import require_memory
 from dln_jax.training.swing_ups.any_plant import push_at_half
 from dln_jax.training.swing_ups.learned import MODELS, Obtained, errors_along, obtain, recorded, test_motions

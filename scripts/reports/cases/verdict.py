@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from dln_jax import Robot
-from dln_jax.cli.arguments import arguments_of
-from dln_jax.cli.commands import identify, train_delan
+from dln_jax.commands import identify, train_delan
 from dln_jax.data.robot_files import mjcf
 from dln_jax.errors import FitRefused
 from dln_jax.files import read_json
@@ -24,6 +23,7 @@ from dln_jax.mechanics.trees.description import dh_frames, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.metrics.verdict import LEVELS
 from dln_jax.precision import in_float64
+from dln_jax.runs.arguments import arguments_of
 from dln_jax.types import InputError
 from scripts.reports.robots.simulated_arms import Arm, arm_torques, waves
 from scripts.reports.run import AtLeast, Case, Numbers

@@ -10,9 +10,7 @@ from calls import one_line
 from motions import sums_of_sines
 
 from dln_jax import Robot
-from dln_jax.cli.arguments import arguments_of
-from dln_jax.cli.commands import train_delan
-from dln_jax.cli.encoders import FILTERED, prepare_log
+from dln_jax.commands import train_delan
 from dln_jax.data.checks.channels import flat_share
 from dln_jax.data.checks.derivatives import check_derivatives
 from dln_jax.data.checks.energies import STRONGEST, WEAKEST, covariances
@@ -24,6 +22,8 @@ from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics.trees.description import dh_frames, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.mechanics.trees.recursions import newton_euler
+from dln_jax.runs.arguments import arguments_of
+from dln_jax.runs.encoders import FILTERED, prepare_log
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.poles import cart_pole
 

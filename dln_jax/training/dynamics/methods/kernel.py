@@ -6,10 +6,10 @@ from typing import Any
 
 from jax.sharding import Mesh
 
-from dln_jax.cli.arguments import require_positive_if_given, resolved
 from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.kernel import choose_kernel, fit_kernel
 from dln_jax.learning.objectives import Objective
+from dln_jax.runs.arguments import require_positive_if_given, resolved
 from dln_jax.training.dynamics.methods.direct import refined_if_asked, training_of, with_needed_offset
 from dln_jax.training.dynamics.options import KernelOptions
 from dln_jax.training.dynamics.recorded import Recorded

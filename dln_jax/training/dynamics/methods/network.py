@@ -6,9 +6,6 @@ from typing import Any
 import numpy as np
 from jax.sharding import Mesh
 
-from dln_jax.cli.arguments import refuse_given, require_positive_if_given, resolved
-from dln_jax.cli.optimisers import name_of, optimiser_named
-from dln_jax.cli.progress import progress
 from dln_jax.data.splits import Split, drawn, merged, select
 from dln_jax.learning import dynamics
 from dln_jax.learning.dynamics import MANY_JOINTS, Suited, suited_network
@@ -16,6 +13,9 @@ from dln_jax.learning.engine.checkpoint import Checkpoint
 from dln_jax.learning.engine.fit import fit as train_problem
 from dln_jax.learning.engine.problem import Problem, Training, require_finite_start
 from dln_jax.learning.objectives import Objective
+from dln_jax.runs.arguments import refuse_given, require_positive_if_given, resolved
+from dln_jax.runs.optimisers import name_of, optimiser_named
+from dln_jax.runs.progress import progress
 from dln_jax.sizes import require_network
 from dln_jax.training.dynamics.methods.growth import grow_to_target
 from dln_jax.training.dynamics.options import NETWORK, AdamOptions, NetworkOptions

@@ -13,7 +13,6 @@ from jax.sharding import Mesh
 from rich.console import Console
 from rich.table import Table
 
-from dln_jax.cli.arguments import class_with, require_positive_if_given
 from dln_jax.data.encoders.sampling import noise_of
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
@@ -31,6 +30,7 @@ from dln_jax.mechanics.trees.description import tree_to_json
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.rigid_tree import USUAL, RigidTreeParameters
 from dln_jax.models.serial_tree import tree_of
+from dln_jax.runs.arguments import class_with, require_positive_if_given
 from dln_jax.training.dynamics.methods.direct import training_of
 from dln_jax.training.dynamics.methods.learned_tree import needs_of_tree
 from dln_jax.training.dynamics.options import NETWORK, Options, SelectionOptions, options_of

@@ -1,1 +1,0 @@
-"""Shared parts of the commands: typed arguments, one-line errors, progress and tables."""

@@ -1,0 +1,62 @@
+"""Evaluate a stored policy of a soft creature on any ground: how often it falls, and how far it goes.
+
+Runs episodes from perturbed starts, on the steepest slopes, up and down, that --slope allows; ground that is not stated
+is that of the training. Prints the episodes without a fall, the distances before a fall, and a verdict: good from 95 %
+without a fall, if none of them goes backwards, and refused below 50 %, with exit status 1. Writes metrics.json.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from dln_jax.runs.arguments import Unstated
+from dln_jax.runs.options import Folder
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments(Folder):
+    """The policy, its ground, and where the results go."""
+
+    run: Path
+    """Folder of a run of train_locomotion."""
+    start: Unstated[float] = None
+    """Standard deviation of the vertices' initial positions, m; of their velocities, 10 times as much in m/s (default:
+    the training's)."""
+    slope: Unstated[float] = None
+    """Slope of the ground, degrees (default: the training's largest)."""
+    rough: Unstated[float] = None
+    """Largest height of bumps, m (default: the training's)."""
+    push: Unstated[float] = None
+    """Change of velocity by the pushes, m/s (default: the training's)."""
+    starts: int = 100
+    """Number of episodes."""
+    steps: int = 2000
+    """Steps of an episode, 0.033 s each."""
+    seed: int = 1_000_000
+    """Seed of the starts, 0 to 4294967295; the default is one that no training draws."""
+
+
+def main(options: Arguments) -> None:
+    """Evaluates the policy, prints and writes the numbers."""
+    from dln_jax.files import write_json
+    from dln_jax.locomotion.perturbed import numbers_of, perturbed_trials
+    from dln_jax.runs.stored_arguments import command_folder
+    from dln_jax.training.locomotion_evaluation import judge, load_policy
+    from dln_jax.training.results import print_numbers
+    from dln_jax.types import require_positive, require_seed
+
+    sizes = {"starts": options.starts, "steps": options.steps}
+    require_positive(**sizes)
+    require_seed(options.seed)
+    ground = {name: getattr(options, name) for name in ("start", "slope", "rough", "push")}
+    task, policy, parameters, _ = load_policy(options.run, **ground)
+    with command_folder(options, "evaluate_locomotion") as folder:
+        trials = perturbed_trials(task, policy, parameters, **sizes, seed=options.seed)
+        verdict, numbers = judge(trials, options.steps), numbers_of(trials, options.steps)
+        write_json(folder / "metrics.json", {**numbers, "verdict": float(verdict.number)})
+        rows = [(name.replace("_", " "), f"{value:.4g}") for name, value in numbers.items()]
+        ground_shown = ", ".join(f"{name} {value:g}" for name, value in task.variation._asdict().items())
+        print_numbers(rows, title=f"{task.creature.name}: {ground_shown}", columns=("quantity", "value"))
+        print(verdict.line)
+        print(f"run folder: {folder}")
+    if verdict.level == "refused":
+        raise SystemExit(1)

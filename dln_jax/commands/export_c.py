@@ -1,0 +1,60 @@
+"""Export the model of a run as C99 source without dependencies: header, source, a demo and a CMake file.
+
+The run is one of a training command. The functions take one state, in SI units. A model of dynamics has inverse and
+forward dynamics, gravity, Coriolis force, friction, mass matrix, energy, integration steps x_next = F(x, u, dt), and
+the exact derivatives of all of them. A model of a phase space has rates and steps; a differential network has its
+value, Jacobian and Hessian. Without --functions, all functions are exported except those that take long to compile.
+The C code does not allocate memory and keeps no state. dln_jax.load_c compiles it and calls it from Python;
+dln_jax.export_c exports any other JAX function.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from dln_jax.runs.arguments import Unstated
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to export, and where."""
+
+    run: Path
+    """Folder of a training run, with model.json and model.safetensors."""
+    out: Path
+    """Folder for NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt; created if missing."""
+    functions: Unstated[tuple[str, ...]] = None
+    """Names, such as inverse_dynamics step_rk4_jacobian (default: all; a wrong name lists them)."""
+    precision: Unstated[Literal["f32", "f64"]] = None
+    """float or double (default: the precision of the training)."""
+    name: str = "model"
+    """Prefix of the files' and functions' names in C."""
+    iterations: int = 3
+    """Newton steps of the implicit midpoint rule."""
+    temperature: Unstated[float] = None
+    """Temperature of the C functions, °C, if friction depends on it (default: the reference of the identification)."""
+    libm: bool = False
+    """Call the C library's exp, expm1, tanh, sin, cos, log and log1p instead of vectorisable ones."""
+    casadi: bool = False
+    """Add NAME_casadi.c: the functions with exact derivatives for CasADi's external and for acados."""
+    finite: bool = False
+    """Assume finite arguments and skip the structural zeros of derivatives; a NaN may then not reach all results."""
+    overwrite: bool = False
+    """Replace the files of an earlier export (files of a run are never replaced)."""
+
+
+def main(options: Arguments) -> None:
+    """Exports the model, and prints the files and the functions left out."""
+    from dln_jax.export.c.run import export_run
+
+    paths = export_run(
+        options.run, options.out, functions=options.functions, name=options.name, precision=options.precision,
+        iterations=options.iterations, temperature=options.temperature, libm=options.libm, casadi=options.casadi,
+        finite=options.finite,
+        overwrite=options.overwrite,
+    )  # fmt: skip
+    print(f"{options.out}: {', '.join(path.name for path in paths)}")
+    for path in paths:
+        if path.suffix in (".h", ".c"):
+            left_out = [line for line in path.read_text().splitlines() if line.startswith(" * Left out: ")]
+            print(*(line[3:] for line in left_out), sep="\n", end="\n" * bool(left_out))

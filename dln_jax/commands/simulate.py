@@ -1,0 +1,83 @@
+"""Simulate a soft body by implicit time steps: a cantilever, a twisted bar, a sliding block, a falling body, a crawler.
+
+Prints the speed and how well the steps were solved, and writes a run folder: motion.gif, energy.png (energies against
+time, which show what the implicit step damps), moments.png, metrics.json, report.json and config.json. Bodies have
+1000 kg/m³; in the plane they are 1 m thick.
+
+Your own mesh: --mesh FILE for the scenes beam and drop, with the last axis up. Formats: .msh of Gmsh (2.2 and 4.1)
+and, with the extra [mesh], .vtk, .vtu, .obj and TetGen's .ele. Tetrahedra form a body in space, triangles with constant
+z a body in the plane; physical groups become named sets, for --pin. The command prints what it left out or repaired.
+An .npz has `vertices` [n, 2 or 3] in m, `elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0) and, for the
+beam, optionally `held` [k] (vertices; by default those of the smallest x).
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from dln_jax.runs.arguments import Unstated
+from dln_jax.runs.options import Drawn, Folder
+
+
+@dataclass(frozen=True)
+class Arguments(Folder, Drawn):
+    """What to simulate, how, and where the results go. Unset options take the scene's defaults."""
+
+    scene: Literal["beam", "twist", "slope", "drop", "creature", "all"] = "beam"
+    """The scene to simulate; all: every scene in its own subfolder, and one figure of all."""
+    integrator: Literal["backward-euler", "bdf2", "midpoint", "average-vector-field"] = "backward-euler"
+    """backward-euler damps, bdf2 (second order) damps little, midpoint (second order) does not damp,
+    average-vector-field (second order) keeps the energy."""
+    halvings: int = 0
+    """Repeat steps that do not converge in shorter parts, down to --dt / 2^halvings; not with bdf2."""
+    dt: Unstated[float] = None
+    """Time step in s."""
+    seconds: Unstated[float] = None
+    """Duration of the motion in s."""
+    cells: Unstated[int] = None
+    """Cells across the body (drop: rings of the disc); not for the creature."""
+    dimension: Unstated[int] = None
+    """beam, drop: 2 or 3."""
+    youngs_modulus: Unstated[float] = None
+    """E in Pa; not for the creature."""
+    poisson_ratio: Unstated[float] = None
+    """Between -1 and 0.5; not for the creature."""
+    friction: Unstated[float] = None
+    """slope, drop: Coulomb's coefficient of friction."""
+    turns: Unstated[float] = None
+    """twist: turns of one end against the other."""
+    material: Unstated[Literal["stable-neo-hookean", "neo-hookean", "st-venant-kirchhoff", "corotated"]] = None
+    """Not for the creature (default: stable-neo-hookean)."""
+    order: Unstated[int] = None
+    """1: linear elements (default); 2: quadratic elements, which do not lock in bending. Not for the creature."""
+    mixed: bool = False
+    """Quadratic elements with one pressure each, for nearly incompressible bodies (nu near 0.5); needs --order 2."""
+    mesh: Unstated[Path] = None
+    """beam, drop: your own mesh, as described above."""
+    scale: Unstated[float] = None
+    """--mesh: length of the file's unit in m, such as 0.001 for millimetres (default: 1)."""
+    pin: Unstated[str] = None
+    """beam with --mesh: named sets that are held, separated by commas."""
+    youngs_modulus_of: Unstated[str] = None
+    """--mesh: E in Pa of named sets of elements, as tip=1e6,core=5e6."""
+    pressure: Unstated[str] = None
+    """--mesh: gauge pressure in Pa in chambers, as inner=2e4 for all closed cavities or wall=2e4,bag=1e3 for chambers
+    whose facets are in named sets; flat caps close their openings."""
+    load: Unstated[str] = None
+    """--mesh: total force in N on named sets, as tip=0,-5 or tip=0,-5;side=2,0: two components in the plane, three in
+    space, spread over the area of the set, or over its vertices if it covers no part of the surface."""
+    contact: bool = False
+    """beam, twist, drop: keep bodies apart, and each from itself, with friction 0.3; backward-euler or bdf2."""
+    vtu: bool = False
+    """Also write motion.pvd and its .vtu files, for ParaView (extra [mesh])."""
+    precision: Literal["f32", "f64"] = "f64"
+    """Floating-point type."""
+    seed: int = 0
+    """drop: seed of the rate of rotation and of the box's tilt."""
+
+
+def main(options: Arguments) -> None:
+    """Simulates one scene into the run folder, or all scenes into subfolders with a combined picture."""
+    from dln_jax.training.simulation import simulate_all
+
+    simulate_all(options)

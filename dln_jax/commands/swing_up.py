@@ -1,0 +1,84 @@
+"""Swing up a pole with a model that was learned from it: explore the plant, learn, design a controller, close the loop.
+
+The simulated plants have dry friction, limits, encoders, noise and torques that act a sample late, at 500 Hz. They are
+explored without a model; only q and the commanded torques are recorded. Models: delan (a structured deep Lagrangian
+network with friction), identified (linear in its parameters), analytic (the nominal dimensions, no friction), known
+(the plant itself). All use the same energy law, regulator and friction compensation, with the same gains, and get their
+states from a Kalman filter of the model. A run folder gets data.npz, the model, metrics.json, config.json, and a figure
+and an animation of the runs.
+
+--plant also takes an MJCF or URDF file: a cart-pole, a rotary pendulum, an acrobot, a pendubot, or another chain with a
+passive joint. MuJoCo simulates it, with encoders and torques that act a sample late. It is explored without a model of
+it, the model is identified, and trials of the model choose all gains (law.json).
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from dln_jax.errors import InputError
+from dln_jax.runs.arguments import Unstated, choice
+from dln_jax.runs.options import Drawn, Folder
+
+FILES = (".xml", ".mjcf", ".urdf")
+"""Suffixes of robot files."""
+
+
+@dataclass(frozen=True)
+class Arguments(Folder, Drawn):
+    """Plant, model, and where the results go."""
+
+    plant: Annotated[str, choice(("rotary-pendulum", "cart-pole", "furuta", "FILE"))] = "rotary-pendulum"
+    """The plant; furuta is another name of the rotary pendulum. FILE is the path of an MJCF or URDF file."""
+    actuated: Unstated[str] = None
+    """Joints of the file with a motor, comma-separated names or numbers from 0 (default: those with an actuator or
+    a transmission)."""
+    control: Unstated[float] = None
+    """Largest force of the motors of the file, N m or N (default: as stated in the file)."""
+    model: Annotated[Unstated[str], choice(("delan", "identified", "analytic", "known"), unstated=True)] = None
+    """Model for the design of the controller (default: delan; for a file, identified)."""
+    estimator: Annotated[str, choice(("extended", "unscented", "differences"))] = "extended"
+    """Where the law's states come from: a Kalman filter of the encoders' readings, or their differences."""
+    recover: Annotated[str, choice(("swing-up", "plans"))] = "swing-up"
+    """How the plant comes up again after a push: as from hanging, or by plans from the state after the push, which are
+    improved on the way."""
+    push: float = 0.0
+    """Jump of the passive joints' rates in the middle of every run, 5 s after its start, rad/s (default: no push)."""
+    seconds_of_data: float = 30.0
+    """Seconds of motion to learn from, at least 12, including an episode for validation."""
+    starts: int = 100
+    """Number of starts near hanging at rest."""
+    seed: int = 0
+    """Seed of the exploration, the network's initial parameters, the starts and the noise."""
+
+
+def main(options: Arguments) -> None:
+    """Explores the plant, learns the model, swings up and writes the run folder; a refused law exits with status 1."""
+    from dln_jax.runs.stored_arguments import command_folder
+    from dln_jax.training.swing_ups import of_file, run
+
+    file = Path(options.plant)
+    if not (file.suffix.lower() in FILES or file.is_file()):
+        if options.actuated is not None or options.control is not None:
+            raise InputError(f"--actuated and --control belong to a file; --plant is {options.plant!r:.40}")
+        model = options.model or "delan"
+        task = run.asked(
+            options.plant, model, options.seconds_of_data, options.starts, options.seed, options.estimator,
+            options.recover, options.push,
+        )  # fmt: skip
+        with command_folder(options, "swing_up") as folder:
+            run.swing_up(task, folder, figures=options.figures)
+            print(f"run folder: {folder}")
+        return
+    if options.model not in (None, "identified"):
+        raise InputError(f"--model is {options.model!r:.40}; the model of a file is identified")
+    actuated = options.actuated.split(",") if options.actuated else ()
+    of_plant = of_file.asked(
+        file, actuated, options.control, options.seconds_of_data, options.starts, options.seed,
+        options.estimator, options.recover, options.push,
+    )  # fmt: skip
+    with command_folder(options, "swing_up") as folder:
+        metrics = of_file.swing_up_file(of_plant, folder, figures=options.figures)
+        print(f"run folder: {folder}")
+    if metrics["success_share"] < of_file.LEAST_SHARE:
+        raise SystemExit(1)

@@ -1,0 +1,83 @@
+"""Train a value function: the cost to go of a plant as a network, whose slope is the best control in closed form.
+
+Trains by fitted value iteration, or on the residual of the Hamilton-Jacobi-Bellman equation, prints how long that took
+and what the law costs from 100 starts near hanging and 100 anywhere, and writes a run folder: value.safetensors and
+value.json (load them with dln_jax.training.values.load_value), metrics.json, config.json, and figures of V and of the
+closed loop. --out FOLDER --resume continues an interrupted run.
+
+--plant also takes an MJCF or URDF file, and --run the folder of a learned or identified model. Costs, box and times
+then come from the plant's natural scales and limits, and are printed. A law that does not bring its starts up is
+refused with exit status 1, unless your own --iterations ended the training.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from dln_jax.runs.arguments import Unstated, Variants, choice
+from dln_jax.runs.options import Drawn, Resumable, Scaled
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """Plant, method and networks."""
+
+    plant: Annotated[str, choice(("pendulum", "cart-pole", "rotary-pendulum", "FILE"))] = "pendulum"
+    """The plant and its costs. FILE is the path of an MJCF or URDF file."""
+    run: Unstated[Path] = None
+    """Folder of a learned or identified model that is the plant (default: --plant)."""
+    actuated: Unstated[str] = None
+    """Own plant: joints with a motor, comma-separated names or numbers from 0 (default: the file's or the model's)."""
+    control: Unstated[str] = None
+    """Own plant: largest force of the motors, N m or N, one for all or one each (default: as stated in the file)."""
+    positions: Unstated[str] = None
+    """Own plant: LOW:HIGH or free for each joint, rad or m, comma separated (default: the file's; of a model, free)."""
+    weights: Unstated[str] = None
+    """Own plant: weights of the squared deviations of coordinates and rates (default: by the plant's scales)."""
+    effort: Unstated[float] = None
+    """Own plant: cost of half the motors' limits over that of hanging (default: 0.25)."""
+    box: Unstated[str] = None
+    """Own plant: half widths of the box of coordinates and rates (default: by the plant's scales)."""
+    robust: float = 0.0
+    """Train against the worst errors of masses and motors up to this share."""
+    method: Literal["fitted", "residual"] = "fitted"
+    """fitted: value iteration along trajectories of the model; residual: the equation itself, by Gauss-Newton."""
+    goal: Unstated[str] = None
+    """Posture to hold, rad or m, separated by commas (default: upright)."""
+    width: Unstated[int] = None
+    """Hidden units per layer (default: 96; residual: 24)."""
+    depth: Unstated[int] = None
+    """Hidden layers (default: 3; residual: 2)."""
+    members: Unstated[int] = None
+    """Number of networks, whose mean is V (default: 1)."""
+    iterations: Unstated[int] = None
+    """Iterations of value iteration (default: 48 or 80 by the plant), or of Gauss-Newton per discount (15)."""
+    seed: int = 0
+    """Seed of parameters and states."""
+    seeds: int = 1
+    """Number of trainings; the best in validation is kept."""
+
+
+def options_of(stated: Mapping[str, Any]) -> tuple[type, ...]:
+    """Options of the training, which a stored value function does not need."""
+    return () if stated.get("stored") else (TrainingOptions,)
+
+
+@dataclass(frozen=True)
+class Arguments(Scaled, Drawn, Resumable):
+    """Plant, method, and where the results go."""
+
+    VARIANTS: ClassVar = Variants(options_of, {TrainingOptions: "a training, without --stored"})
+    starts: int = 100
+    """Number of starts in the evaluation, both hanging and anywhere."""
+    stored: Unstated[Path] = None
+    """Folder of a run whose value function is evaluated on its plant; nothing is trained (default: train one)."""
+
+
+def main(options: Arguments) -> None:
+    """Trains and evaluates a value function, or evaluates a stored one, and writes the run folder."""
+    from dln_jax.training.pipeline import train
+    from dln_jax.training.value_training import VALUES
+
+    train(VALUES, options, "train_value")

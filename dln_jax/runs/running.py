@@ -1,0 +1,166 @@
+"""Shared parts of the command lines: one-line errors, scene names, and run folders."""
+
+import contextlib
+import dataclasses
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from dln_jax.errors import FitRefused, InputError, ProcessLost
+from dln_jax.runs.arguments import parse
+from dln_jax.runs.options import CompilationCache, NoCompilationCache
+from dln_jax.sizes import require_magnitude, require_within
+from dln_jax.time_limit import IMPORTED, counting_from
+
+MOST_CHARACTERS = 400
+"""Characters shown at either end of a long message; the middle is left out."""
+INTERRUPTED = 130
+"""Exit status after an interrupt, as shells have it."""
+LARGEST_SEED = 2**32 - 1
+"""Largest seed of NumPy and JAX."""
+
+
+def run(
+    main: Callable[[Any], None],
+    arguments: type,
+    *,
+    prog: str,
+    line: Sequence[str] | None = None,
+    description: str | None = None,
+    from_shell: bool = False,
+    joining: int | None = None,
+) -> None:
+    """Parses the command line and runs `main`; errors and exit statuses as for `as_one_line`.
+
+    Args:
+        prog: the command as the user typed it.
+        line: words after the command (default: those of this process).
+        description: what the command does, for its help (default: the docstring of the module of `main`).
+        from_shell: whether the process runs only this command; compiled programs are then kept.
+        joining: seconds that several processes wait for each other to start (default: that of `scale.processes`).
+    """
+    with as_one_line(prog, None):
+        common = NoCompilationCache if getattr(arguments, "MEASURES_COMPILATION", False) else CompilationCache
+        description = description or sys.modules[main.__module__].__doc__
+        line = sys.argv[1:] if line is None else line
+        try:
+            whole = parse(arguments, prog=prog, description=description, line=line, common=common)
+        finally:
+            sys.stdout.flush()  # the help; raises BrokenPipeError here if its reader has closed the pipe
+        require_possible(whole.own)
+        # JAX takes a second to import, which the help and a mistake do not need.
+        from dln_jax.runs import compilation_cache, scaled
+        from dln_jax.runs.stored_arguments import with_stored_arguments
+        from dln_jax.scale import processes
+
+        # Data and references are float64; models state their own precision.
+        compilation_cache.enable_double_precision()
+        member = scaled.membership_in(whole.own)
+        options = with_stored_arguments(whole.own, arguments) if getattr(whole.own, "resume", False) else whole.own
+        before = compilation_cache.compilation() if from_shell else None
+        unkept = compilation_cache.keep(whole.common.compilation_cache) if from_shell else ""
+
+    began = IMPORTED if from_shell else time.perf_counter()
+
+    def work(options: Any) -> None:
+        with as_one_line(prog, options), processes.losses_named(scaled.remedy_of(options)), counting_from(began):
+            main(options)
+            if before and (text := compilation_cache.summary(before, unkept)):
+                print(text)
+            sys.stdout.flush()
+
+    if member is not None:
+        with as_one_line(prog, options):
+            options = scaled.joined(member, options, **({} if joining is None else {"seconds": joining}))
+    try:
+        work(options)
+    except SystemExit as stop:
+        # After an interrupt XLA may still run a program, and would abort a process that ends under it.
+        if member is None and not (from_shell and stop.code == INTERRUPTED):
+            raise
+        scaled.end_at_once(stop.code if isinstance(stop.code, int) else 1)
+
+
+@contextlib.contextmanager
+def as_one_line(prog: str, options: Any) -> Iterator[None]:
+    """Reports errors in one line and sets the exit status.
+
+    The status is 2 for a user's mistake, and for memory, devices or disk space that the machine lacks; 1 for a refused
+    fit, 3 for a lost process, 130 for an interrupt, 141 for a closed output pipe.
+    """
+    try:
+        yield
+    except FitRefused as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+    except ProcessLost as error:
+        _say(f"error: {error}")
+        raise SystemExit(3) from None
+    except InputError as error:
+        raise _refusal(str(error)) from None
+    except MemoryError as error:
+        raise _refusal(f"out of memory ({error or 'no more can be had'}); ask for less") from None
+    except (RuntimeError, AssertionError) as error:
+        if "RESOURCE_EXHAUSTED" in str(error):
+            raise _refusal(f"out of memory ({str(error).splitlines()[0]:.200}); ask for less") from None
+        from dln_jax.scale.devices import unusable_platform
+
+        if (text := unusable_platform()) is None:
+            raise
+        raise _refusal(text) from None
+    except BrokenPipeError:  # the reader of the output has closed the pipe
+        _say("")
+        raise SystemExit(141) from None
+    except OSError as error:  # a full disk, or a file that has been removed
+        where = "" if error.filename is None else f"{error.filename}: "
+        raise _refusal(f"{where}{error.strerror or error}") from None
+    except KeyboardInterrupt as stop:
+        _say(interrupted(prog, options, *stop.args))
+        raise SystemExit(INTERRUPTED) from None
+
+
+def _refusal(message: str) -> SystemExit:
+    """Prints an error as one line, and returns the exit for a user's mistake (status 2)."""
+    shown = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in message)
+    if len(shown) > 2 * MOST_CHARACTERS:
+        shown = f"{shown[:MOST_CHARACTERS]} ... {shown[-MOST_CHARACTERS:]}"
+    _say(f"error: {shown}")
+    return SystemExit(2)
+
+
+def _say(last: str) -> None:
+    """Prints a command's last line on standard error. Redirects closed streams so that the exit raises no error."""
+    for stream, text in ((sys.stdout, ""), (sys.stderr, last)):
+        try:
+            print(text, end="\n" if text else "", file=stream, flush=True)
+        except OSError:
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def interrupted(command: str, options: Any, folder: Path | None = None) -> str:
+    """Message after an interrupt: how to resume (if the arguments have `resume`), or that the folder is incomplete."""
+    if folder is None:
+        return "interrupted"
+    if hasattr(options, "resume") and (folder / "config.json").is_file():
+        return f"interrupted; continue with: {command} --out {folder} --resume"
+    return f"interrupted; {folder} is incomplete"
+
+
+def require_possible(options: Any) -> None:
+    """Raises `InputError` for an option that is not finite or is implausibly large."""
+    for name, value in dataclasses.asdict(options).items():
+        option = f"--{name.replace('_', '-')}"
+        if isinstance(value, float):
+            if not math.isfinite(value):
+                raise InputError(f"{option} is {value}; expected a finite number, or leave it out")
+            require_magnitude(option, value)
+        elif isinstance(value, int) and name == "seed":
+            if not 0 <= value <= LARGEST_SEED:
+                raise InputError(f"seed is {value}; expected whole numbers from 0 to {LARGEST_SEED}")
+        elif isinstance(value, int):
+            require_within({option: value})

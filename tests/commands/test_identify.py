@@ -1,0 +1,119 @@
+"""The command end to end: a URDF and a log become a run folder, a robot's file and C; mistakes are one line."""
+
+import re
+
+import numpy as np
+import pytest
+from calls import assert_refused, command, exit_status, json_of, one_line
+from numpy.testing import assert_allclose, assert_array_equal
+from planar_arm import FRICTION, URDF, motions
+
+from dln_jax import load, load_c, read_robot
+from dln_jax.commands import identify
+from dln_jax.export.c.run import export_run
+from dln_jax.training.identification.task import noises, split
+
+pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
+LOG = "--robot arm.urdf --data log.npz"
+QUICK = "--no-figures --no-uncertainty"
+
+
+@pytest.fixture(scope="module")
+def workplace(folder):
+    """A robot's file with masses that are too small, and a log of the true one, columns the other way round."""
+    (folder / "arm.urdf").write_text(URDF)
+    tree = read_robot(folder / "arm.urdf").tree
+    tree = tree._replace(inertias=1.5 * tree.inertias, armature=np.array([0.1, 0.2]))
+    log = motions(0, noise=0.05, samples=400, tree=tree)
+    swapped = {key: getattr(log, key)[:, ::-1] for key in ("q", "qd", "qdd", "tau")}
+    np.savez("log.npz", t=log.t, trajectory=log.trajectory, joint_names=["elbow", "shoulder"], **swapped)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def identified(workplace):
+    command(identify, LOG, "--out run")
+    return workplace / "run"
+
+
+def test_sound_log_gives_a_good_run_folder_like_every_other(identified):
+    assert {path.name for path in identified.iterdir()} == {
+        *(".lock", "config.json", "metrics.json", "model.json", "model.safetensors", "parameters.json", "report.txt"),
+        *("torque.png", "friction.png", "arm_identified.urdf"),
+        *("uncertainty.json", "uncertainty.safetensors", "uncertainty.png"),
+    }
+    metrics, config, stored = (json_of(identified / f"{name}.json") for name in ("metrics", "config", "parameters"))
+    assert metrics["nmse"] < 1.1 * metrics["least_squares_nmse"] + 1e-4 < metrics["file_nmse"]
+    assert metrics["noise_nmse"] < metrics["nmse"] < 0.05 < metrics["file_nmse"]
+    assert metrics["coverage_95_share"] > 0.85 and metrics["noise_joint_1"] == pytest.approx(0.05, rel=0.15)
+    assert len(stored["base"]) == metrics["base_parameters"] and len(stored["parameters"]) == metrics["parameters"]
+    verdict = config["chosen"]["verdict"]
+    assert metrics["verdict"] == 0 and verdict["level"] == "good" and "the robot's file" in verdict["reason"]
+
+
+@pytest.mark.slow
+def test_the_model_is_loaded_and_exported_and_the_file_has_what_was_identified(identified, tmp_path):
+    run = load(identified)
+    state = np.random.default_rng(1).normal(size=(3, 2))
+    assert_allclose(run.parameters.coulomb, FRICTION["coulomb"], atol=0.05)
+    export_run(identified, tmp_path / "c", functions=("inverse_dynamics",))
+    in_c = load_c(tmp_path / "c").inverse_dynamics
+    assert_allclose(in_c(*state), run.dynamics.inverse_dynamics(*state), rtol=1e-12)
+    robot = read_robot(identified / "arm_identified.urdf")
+    assert_allclose(robot.tree.inertias, run.parameters.inertias, rtol=1e-12, atol=1e-14)
+    assert_array_equal(robot.damping, run.parameters.viscous)
+    assert re.search(r"Armature, .*: shoulder 0\.\d+, elbow 0\.\d+", (identified / "arm_identified.urdf").read_text())
+
+
+def test_least_squares_that_is_no_body_is_kept_without_a_file(workplace, capsys):
+    command(identify, LOG, "--out free --no-consistent --robust", QUICK)
+    said = capsys.readouterr().out
+    assert "no arm_identified.urdf: the least-squares links behind" in said
+    assert "10 blocks" not in said and "blocks of time of the one trajectory" in said
+    assert not list((workplace / "free").glob("*.urdf")) and load("free").dynamics is not None
+
+
+def test_ruined_log_is_refused_without_a_robots_file(workplace, capsys):
+    log = dict(np.load("log.npz"))
+    for name, factor, words in (("turned", -1, ""), ("milli", 1000, "times the tree's; check the unit of tau")):
+        np.savez("ruined.npz", **{**log, "tau": factor * log["tau"]})
+        # The check of the log sees some of them before.
+        status = exit_status(identify, "--robot arm.urdf --accept-log --data ruined.npz --out", name, QUICK)
+        told = capsys.readouterr()
+        assert status == 1 and told.err.startswith("error: the fit is refused: ") and words in told.err
+        assert "no arm_identified.urdf: the fit is refused" in told.out
+        folder = workplace / name
+        assert json_of(folder / "metrics.json")["verdict"] == 2 and not list(folder.glob("*.urdf"))
+
+
+def test_mistakes_are_one_line(workplace, capsys):
+    log = dict(np.load("log.npz"))
+    np.savez("other.npz", **{**log, "joint_names": ["elbow", "wrist"]})
+    np.savez("one.npz", t=log["t"], q=log["q"][:, :1], tau=log["tau"][:, :1])
+    np.savez("silent.npz", t=log["t"], q=log["q"])
+    (workplace / "broken.urdf").write_text("<robot>")
+    rows = {
+        "--data other.npz": "joint 'shoulder' is not among the data's (elbow, wrist)",
+        "--data one.npz": "the data have 1 joints, the robot 2",
+        "--data silent.npz": "have no tau",
+        "--robot broken.urdf": "not XML",
+        "--regularisation 0": "regularisation is 0.0",
+        "--velocity-scale 0": "velocity_scale is 0.0",
+        "--window 0.3": "--window is for --by motions or both",
+        "--by motions --window -1": "window is -1.0; expected a positive number",
+        "--by forces": "choose from torques, motions, both",
+    }
+    assert_refused(capsys, identify, rows.items(), LOG, out=workplace / "refused")
+
+
+def test_trajectories_are_held_out_whole_and_one_in_blocks_of_time():
+    six, one = (motions(0, samples=samples, trajectories=count) for samples, count in ((10, 6), (60, 1)))
+    for asked, held in ((None, [2]), (["0", "5"], [0, 5])):
+        assert np.unique(split(six, asked).test.trajectory).tolist() == held and not split(six, asked).blocks
+    blocks = split(one, None)
+    assert blocks.blocks and len(blocks.train.t) == 48
+    assert [blocks.test.label[k] for k in np.unique(blocks.test.trajectory)] == ["0[2]", "0[7]"]
+    with one_line("one only"):
+        split(one, ["0"])
+    with one_line("expected 2 positive numbers"):
+        noises("1", 2)

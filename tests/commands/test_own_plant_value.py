@@ -1,0 +1,140 @@
+"""A value function of a file's plant: trained, interrupted, resumed, loaded, judged; and what is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from calls import assert_refused, command, exit_status, json_of, one_line
+from numpy.testing import assert_allclose, assert_array_equal
+
+from dln_jax.commands import train_value
+from dln_jax.control.optimal.action_costs import quadratic
+from dln_jax.control.optimal.fitted import Iteration
+from dln_jax.control.optimal.plants import Evaluation, Starts, ValuePlant, evaluate
+from dln_jax.control.optimal.problem import ControlProblem, rates
+from dln_jax.control.optimal.value_networks import value_network
+from dln_jax.training.value_checkpoints import Kept
+from dln_jax.training.value_plants import Wishes, of_file, of_run, with_factors
+from dln_jax.training.value_training import verdict_of
+from dln_jax.training.values import ValueRun, load_value, value_error
+from dln_jax.zoo.run import save
+
+pytest.importorskip("mujoco", reason="MuJoCo reads the files; it is in the extra [robot]")
+ROD = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" damping="0.05"/>
+<inertial mass="1" pos="0 0 0.5" diaginertia="0.08333 0.08333 0.001"/></body></worldbody>
+<actuator><motor joint="hinge" ctrlrange="-2.5 2.5" ctrllimited="true"/></actuator></mujoco>"""
+TINY = "--width 3 --depth 1 --iterations 2 --starts 3 --no-figures"
+
+
+@pytest.fixture
+def rod(tmp_path):
+    (tmp_path / "rod.xml").write_text(ROD)
+    return tmp_path / "rod.xml"
+
+
+@pytest.fixture
+def brief(monkeypatch):
+    """Iterations of a moment."""
+    # What earlier tests of the process have traced in float64 may hold indices of 64 bits.
+    jax.clear_caches()
+    short = {"starts": 16, "steps": 4, "seconds": 0.2, "batch": 16}
+    monkeypatch.setattr("dln_jax.control.optimal.own_plants.Iteration", lambda **sizes: Iteration(**sizes | short))
+
+
+def test_an_interrupted_run_resumes_to_the_same_bits_and_comes_back(tmp_path, capsys, rod, brief, monkeypatch):
+    arguments = ("--plant", rod, TINY, "--robust 0.1")
+    command(train_value, *arguments, "--out", tmp_path / "whole")
+    output = capsys.readouterr().out
+    assert "hinge 2.5 N m" in output and "box, half widths: hinge 3.14 rad" in output and "verdict: " in output
+    store = Kept.store
+
+    def stop(*state):
+        store(*state)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Kept, "store", stop)
+        assert exit_status(train_value, *arguments, "--out", tmp_path / "cut") == 130
+    command(train_value, "--out", tmp_path / "cut", "--resume")
+    whole, cut = (load_value(tmp_path / name) for name in ("whole", "cut"))
+    x = jnp.array([1.0, -0.5])
+    assert_array_equal(whole.law(x), cut.law(x))
+    one, other = (json_of(tmp_path / name / "metrics.json")["heavy_weak_return_mean"] for name in ("whole", "cut"))
+    assert one == other
+    # The model in the folder is the file's plant.
+    expected = (2.0 + 9.81 / 2 * np.sin(1.0) - 0.05 * -0.5) / (0.25 + 0.08333)
+    assert_allclose(rates(whole.problem)(x, jnp.array([2.0])), [-0.5, expected], rtol=1e-6)
+
+
+def test_the_verdict_counts_the_starts_that_end_up():
+    numbers = {"down_up_share": 1.0, "uniform_up_share": 1.0}
+    # The value of the worst case exceeds the cost.
+    robust = {"heavy_weak_up_share": 1.0, "light_strong_up_share": 1.0}
+    for level, changes in (
+        ("good", {}),
+        ("good", {"value_error": 0.01}),
+        ("good", {"value_error": 0.3, **robust}),
+        ("doubtful", {"uniform_up_share": 0.99}),
+        ("doubtful", {**robust, "heavy_weak_up_share": 0.9}),
+        ("doubtful", {"value_error": 0.3}),
+        ("refused", {"down_up_share": 0.89}),
+        ("refused", {"down_up_share": np.nan}),
+    ):
+        assert verdict_of({**numbers, **changes}, 100).level == level, changes
+    assert "V differs from the cost of its law by 30.0%" in verdict_of({**numbers, "value_error": 0.3}, 100).reason
+
+
+def test_error_of_a_known_value_is_that_of_the_quadrature():
+    """dx/dt = u with cost (x² + u²)/2, discount 1.5: V = p x² / 2 with p² + 1.5 p = 1, so p = 1/2 and u = -x/2."""
+    problem = ControlProblem(
+        lambda x: jnp.zeros(1),
+        lambda x: jnp.ones((1, 1)),
+        lambda x: x[0] ** 2 / 2,
+        quadratic(1.0),
+        1.5,
+        [-1.0],
+        [1.0],
+        ("prismatic",),
+        [0.0],
+    )
+    plant = ValuePlant(problem, 1.0, Starts([0.0], [0.0], [1.0]), (0,), evaluation=Evaluation(1000.0, 10.0, 1))
+    value = lambda scale, x: (scale * x[0] ** 2 / 4, scale * x / 2)  # noqa: E731
+    network = value_network(problem)._replace(value_and_gradient=value)
+    runs = evaluate(plant, lambda x: -x / 2, np.linspace(0.3, 0.9, 4)[:, None])
+    for scale in (1.0, 1.2):
+        error = value_error(ValueRun("integrator", plant, network, scale), runs)
+        assert error == pytest.approx(scale - 1, abs=2e-3)
+    assert np.isnan(value_error(ValueRun("", plant, network, 1.0), runs._replace(settled=np.full(4, np.inf))))
+
+
+def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys, rod):
+    rows = {
+        "--actuated ²": "there is no joint '\u00b2'",
+        "--actuated elbow": "there is no joint 'elbow'",
+        "--control -1": "expected finite positive numbers",
+        "--control 1 --goal 0.6": "the limits are",
+        "--positions 1:0": "expected LOW:HIGH or free",
+        "--positions free,free": "2 ranges; the plant has 1 joints",
+        "--positions -1:1": "is outside",
+        "--weights 1": "expected 2 positive numbers",
+        "--robust 1.5": "robust is 1.5",
+    }
+    assert_refused(capsys, train_value, rows.items(), "--plant", rod, out=tmp_path / "run")
+    rows = {"--effort 1": "--effort is an option of one's own plant", "--run /nowhere": "no such file"}
+    assert_refused(capsys, train_value, rows.items(), out=tmp_path / "run")
+
+
+def test_the_model_in_a_folder_is_the_same_plant_as_its_file(tmp_path, rod):
+    known = of_file(rod, Wishes())
+    save(tmp_path, known.own.description, known.own.parameters)
+    stored = of_run(tmp_path, Wishes(control=2.5))
+    for name in ("goal", "hanging", "scale", "weights", "box", "limits"):
+        assert_allclose(getattr(stored.own.problem, name), getattr(known.own.problem, name), atol=1e-5)
+    x, u = jnp.array([0.7, 1.0]), jnp.array([1.5])
+    accelerations = [rates(plant)(x, u) for plant in (stored.plant.problem, known.plant.problem)]
+    assert_allclose(*accelerations, rtol=1e-9)
+    # A body of 1.2 times the mass is accelerated by the motor 1 / 1.2 as much.
+    heavy, light = (plant.actuation(x)[1, 0] for plant in (with_factors(known, [1.2, 1.0]), known.plant.problem))
+    assert float(heavy / light) == pytest.approx(1 / 1.2, rel=1e-9)
+    with one_line("states no limits of the motors"):
+        of_run(tmp_path, Wishes())

@@ -1,0 +1,99 @@
+"""One command explores, learns and swings up, and refuses mistakes before anything is written."""
+
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+from calls import assert_refused, command, exit_status, json_of, refused
+
+from dln_jax import InputError, build, describe
+from dln_jax.commands import swing_up
+from dln_jax.control.plants.exploring import Exploration, Explored, recording_of
+from dln_jax.control.plants.runs import PlantRun, Trials
+from dln_jax.control.plants.tuning import Tuned
+from dln_jax.control.regulators import Regulator
+from dln_jax.data import schema
+from dln_jax.learning.recordings import FittedPlant
+from dln_jax.training.swing_ups.any_plant import Learned
+
+MOTOR = "--actuated elbow --control 5"
+
+
+def test_a_run_stores_data_numbers_and_pictures(tmp_path, monkeypatch):
+    # A known model needs no exploration by the laws of learned ones, which take a minute to compile.
+    monkeypatch.setattr("dln_jax.training.swing_ups.learned.Exploration", partial(Exploration, surplus=()))
+    few = "--plant furuta --model known --seconds-of-data 12 --starts 2 --estimator differences --out"
+    command(swing_up, few, tmp_path / "run")
+    found = json_of(tmp_path / "run/metrics.json")
+    assert found["success_share"] == 1 and found["not_finite"] == 0 and found["torque_nmse"] < 1e-20
+    files = {each.name for each in (tmp_path / "run").iterdir()}
+    assert files >= {"config.json", "data.npz", "swing-ups.png", "swing-up.gif"}
+
+
+def test_mistakes_are_one_line_and_leave_nothing(capsys, tmp_path):
+    rows = {
+        "--plant acrobot": "choose from cart-pole, rotary-pendulum, furuta, or a file",
+        "--plant furuta --actuated 1": "belong to a file",
+        "--model feed-forward": "choose from",
+        "--seconds-of-data 1": "expected at least 12 s",
+        "--recover never": "choose from swing-up, plans",
+        "--push inf": "--push is inf; expected a finite number",
+    }
+    assert_refused(capsys, swing_up, rows.items(), out=tmp_path / "run")
+    rows = [
+        ("--actuated wrist", "no joint 'wrist'; the joints are 0 shoulder, 1 elbow"),
+        ("--actuated 0,1", "all 2 joints have a motor"),
+        ("no joint has a motor",),
+        ("--actuated elbow", "states no limit of the motor of joint 'elbow'"),
+        ("--actuated 1 --control -1", "control is [-1.0]"),
+        ("--actuated 1 --control 5 --model known", "the model of a file is identified"),
+    ]
+    file = two_links(tmp_path)
+    assert_refused(capsys, swing_up, rows, "--plant", file, out=tmp_path / "run")
+    # A time step that would fill the memory.
+    file.write_text(file.read_text().replace("<mujoco>", '<mujoco><option timestep="1e-9"/>'))
+    rows = [(MOTOR, "30 s of motion at 1e+09 Hz would take about")]
+    assert_refused(capsys, swing_up, rows, "--plant", file, out=tmp_path / "run")
+
+
+def test_a_recording_that_a_later_step_refuses_is_kept(capsys, tmp_path, monkeypatch):
+    def learn(plant, *_, keep, **__):
+        q = np.random.default_rng(0).normal(size=(2, 10, 2))
+        runs = [PlantRun(np.arange(10) / 500, part, np.zeros((10, 1))) for part in q]
+        keep(Explored(recording_of(runs, plant.layout), ()))
+        raise InputError("the noise of q in the log is 0")
+
+    monkeypatch.setattr("dln_jax.training.swing_ups.of_file.learn_to_swing_up", learn)
+    line = refused(capsys, swing_up, "--plant", two_links(tmp_path), MOTOR, "--out", tmp_path / "run")
+    assert "the noise of q in the log is 0; the recording stays in" in line
+    assert schema.load(tmp_path / "run/data.npz").q.shape == (20, 2)
+
+
+def test_a_law_that_does_not_carry_over_to_the_plant_is_refused_with_the_reason(capsys, tmp_path, monkeypatch):
+    def learn(plant, *_, **__):
+        description = describe("planar-chain", precision="f64", needs=plant.layout.needs)
+        fitted = FittedPlant(description, build(description).init(jax.random.key(0)))
+        law = Tuned(None, "plan", {}, Regulator(np.zeros((1, 4)), np.zeros((4, 4))), 256, 1.0, 0.4, 1.4)
+        return Learned(None, None, fitted, law, None, 9.0)
+
+    few = Trials(np.array([np.inf, 1.0, np.inf]), ("'elbow' moves at 31/s",))
+    place = "dln_jax.training.swing_ups.of_file"
+    monkeypatch.setattr(f"{place}.learn_to_swing_up", learn)
+    monkeypatch.setattr(f"{place}.try_plant", lambda *_, **__: (few, []))
+    assert exit_status(swing_up, "--plant", two_links(tmp_path), MOTOR, "--starts 3 --out", tmp_path / "run") == 1
+    said = capsys.readouterr().out
+    assert "33.3% of 3 starts up" in said and "refused: fewer than half" in said
+    assert "1 of 3 were stopped; the first: 'elbow' moves at 31/s" in said
+
+
+def two_links(folder):
+    """The file of two rods without a limit of their motors."""
+    pytest.importorskip("mujoco", reason="MuJoCo simulates the plant; it is in the extra [robot]")
+    (folder / "mine.xml").write_text(
+        """<mujoco><worldbody><body><joint name="shoulder" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".01" mass=".2"/>
+        <body pos="0 0 -.3"><joint name="elbow" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".01" mass=".2"/></body></body></worldbody></mujoco>"""
+    )
+    return folder / "mine.xml"

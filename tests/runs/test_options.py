@@ -1,0 +1,91 @@
+"""Options are stated without importing JAX: the names and numbers in them are those of the library."""
+
+import dataclasses
+import re
+import subprocess
+import sys
+from types import SimpleNamespace
+from typing import get_args, get_type_hints
+
+from dln_jax.commands import COMMANDS, identify, train_delan, train_diffnet, train_hnn, train_hnn_task, train_value
+from dln_jax.control.optimal.plants import PLANTS
+from dln_jax.identification.consistent import REGULARISATION
+from dln_jax.mechanics.friction.laws import LAWS
+from dln_jax.models.rigid_tree import USUAL
+from dln_jax.nn.activations import ALL
+from dln_jax.runs.arguments import arguments_for, resolved
+from dln_jax.runs.options import SCENES
+from dln_jax.scenes import registry
+from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS
+from dln_jax.training.dynamics.options import AUTO, FITS
+from dln_jax.training.functions import options as functions
+from dln_jax.training.functions.task import NAMED
+from dln_jax.training.hamiltonian import options as phase_spaces
+from dln_jax.training.identification import options as identification
+from dln_jax.zoo.catalogue import CATALOGUE
+
+HELP = """
+import importlib, io, contextlib, sys
+import dln_jax.__main__
+from dln_jax.commands import COMMANDS
+from dln_jax.runs.running import run
+for name in COMMANDS:
+    module = importlib.import_module(f"dln_jax.commands.{name}")
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        run(module.main, module.Arguments, prog=name, line=["--help"])
+    with contextlib.redirect_stderr(io.StringIO()), contextlib.suppress(SystemExit):
+        run(module.main, module.Arguments, prog=name, line=["--no-such-option"])
+    heavy = {"jax", "scipy", "matplotlib", "haiku"} & set(sys.modules)
+    assert not heavy, (name, heavy)
+print(len(COMMANDS))
+"""
+
+
+def test_help_and_mistakes_import_no_jax():
+    done = subprocess.run([sys.executable, "-c", HELP], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == str(len(COMMANDS))
+
+
+def shown(options, name):
+    """The choices that the help of an option shows."""
+    metavar = get_type_hints(options, include_extras=True)[name].__metadata__[0].metavar
+    return set(metavar.strip("{}").split(","))
+
+
+def test_names_and_defaults_in_options_are_those_of_the_library():
+    assert set(SCENES) == set(registry.SCENES)
+    assert set(FITS) - {AUTO} <= set(CATALOGUE)
+    assert set(phase_spaces.GENERATED) == set(PROTOCOLS)
+    assert set(functions.NAMES) == set(NAMED)
+    assert set(identification.IDENTIFIED) == set(LAWS)
+    assert shown(train_value.TrainingOptions, "plant") == {*PLANTS, "FILE"}
+    assert shown(functions.Learned, "activation") == set(ALL)
+    assert set(get_args(get_type_hints(phase_spaces.Motion)["model"])) - {"auto"} <= set(CATALOGUE)
+    defaults = {field.name: field.default for field in dataclasses.fields(identify.Arguments)}
+    assert defaults["regularisation"] == REGULARISATION and defaults["friction"] == ",".join(USUAL)
+
+
+def test_an_option_exists_for_the_choices_that_read_it():
+    for command, stated, present, absent in [
+        (train_delan, {}, "width target scene", "batch samples robot degree"),
+        (train_delan, {"optimizer": "adam"}, "batch width", "samples"),
+        (train_delan, {"data": "log.npz"}, "robot parents seconds", "width optimizer"),
+        (train_delan, {"model": "trigonometric"}, "degree objective", "width seconds seeds"),
+        (train_hnn_task, {}, "trajectories width", "data noise learning_rate degree"),
+        (train_hnn_task, {"task": "measured"}, "data noise order", "trajectories field"),
+        (train_diffnet, {"optimizer": "adam"}, "epochs samples", "steps"),
+        (train_value, {"stored": "run"}, "starts", "plant width seed"),
+    ]:
+        names = {field.name for field in dataclasses.fields(arguments_for(command.Arguments, stated))}
+        assert names >= {*present.split()} and names.isdisjoint(absent.split())
+
+
+def test_every_model_of_a_command_has_a_method():
+    for command in (train_delan, train_hnn):
+        names = re.findall(r"'([\w-]+)'", repr(command.Arguments.__annotations__["model"]))
+        assert names and set(names) <= set(FITS)
+
+
+def test_a_zero_that_was_stated_is_no_default():
+    assert resolved(SimpleNamespace(steps=0, width=None), {"steps": 5, "width": 8}) == {"steps": 0, "width": 8}
