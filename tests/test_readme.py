@@ -30,7 +30,7 @@ PAGES = {path.name: path.read_text() for path in [ROOT / "README.md", *sorted((R
 PROSE = {name: re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE) for name, text in PAGES.items()}
 MOST_WORDS = 900
 """Largest number of words of the README."""
-BARE = "--no-figures --no-low-latency"
+BARE = "--no-figures"
 SMALL = {
     "train_delan": f"--optimizer adam --precision f64 --steps 40 --width 4 --depth 1 --batch 64 {BARE}",
     "train_hnn_task": f"--optimizer adam --steps 2 {BARE}",

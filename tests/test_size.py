@@ -107,7 +107,7 @@ BRIEF = ["--no-figures", "--no-uncertainty"]
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("a training", ["train_delan", "--steps", "5", "--no-low-latency", *BRIEF]),
+        ("a training", ["train_delan", "--steps", "5", *BRIEF]),
         ("identify", ["identify", "--robot", "arm.urdf", "--data", "log.npz", "--test", "last:30%", *BRIEF]),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

@@ -28,11 +28,11 @@ class Arguments(LocomotionOptions, Resumable, Drawn, Scaled):
 def main(options: Arguments) -> None:
     """Trains and evaluates the policy, and writes the run folder."""
     from dln_jax.locomotion.gradient import settings_of
+    from dln_jax.runs.report import print_numbers
     from dln_jax.runs.scaled import mesh_of
     from dln_jax.runs.stored_arguments import command_folder
     from dln_jax.training.locomotion import announce, prepare, trained, write_run
     from dln_jax.training.locomotion_evaluation import parameters_for
-    from dln_jax.training.results import print_numbers
 
     mesh = mesh_of(options)
     task = prepare(options, mesh)

@@ -25,7 +25,15 @@ from dln_jax.data.functions import FunctionSamples, SampleSplit
 from dln_jax.learning.engine.checkpoint import Checkpoint
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser
-from dln_jax.learning.engine.problem import Problem, Progress, Report, Training, mean_square, silent, unmonitored
+from dln_jax.learning.engine.problem import (
+    Problem,
+    Progress,
+    ProgressReport,
+    Training,
+    mean_square,
+    silent,
+    unmonitored,
+)
 from dln_jax.learning.model_selection import Trial, grow
 from dln_jax.nn import differential_mlp, ensembles
 from dln_jax.nn.activations import Activation, activation
@@ -132,7 +140,7 @@ def train(
     optimiser: Optimiser,
     *,
     checkpoint: Checkpoint | None = None,
-    report: Report = silent,
+    report: ProgressReport = silent,
     mesh: Mesh | None = None,
 ) -> Training:
     """Fits the training samples and keeps the parameters with the lowest loss on the validation samples.

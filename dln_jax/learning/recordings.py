@@ -22,7 +22,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.learning.engine.problem import Report, silent
+from dln_jax.learning.engine.problem import ProgressReport, silent
 from dln_jax.learning.momentum import (
     acceleration_misfit,
     cut_momentum_windows,
@@ -222,7 +222,7 @@ def learned(
     *,
     steps: int = STEPS,
     seed: int = 0,
-    report: Report = silent,
+    report: ProgressReport = silent,
     **keywords: Any,
 ) -> FittedPlant:
     """Trains a structured DeLaN with viscous and dry friction and keeps the parameters that are best in validation.

@@ -48,14 +48,6 @@ class Limited:
 
 
 @dataclass(frozen=True)
-class SingleCalls:
-    """How to time single calls of a model."""
-
-    low_latency: bool = True
-    """Time single calls in low-latency mode, too."""
-
-
-@dataclass(frozen=True)
 class Devices:
     """Devices of one process that share the work."""
 

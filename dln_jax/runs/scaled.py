@@ -22,7 +22,7 @@ from dln_jax.scale.mesh import batch_mesh
 from dln_jax.scale.processes import Membership
 from dln_jax.types import InputError
 
-SEEN_BY_USERS = ("figures", "low_latency")
+SEEN_BY_USERS = ("figures",)
 """Options for output that only the first process produces."""
 
 

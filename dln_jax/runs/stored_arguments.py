@@ -19,7 +19,7 @@ FILES = "files"
 """Key in config.json of the SHA-256 digests of input files, by argument name."""
 SCALE = ("devices", "processes", "coordinator", "process_id")
 """Arguments that state where a result is computed."""
-PLACES = ("out", "resume", "figures", "low_latency", "uncertainty", *SCALE)
+PLACES = ("out", "resume", "figures", "uncertainty", *SCALE)
 """Arguments that do not affect the result."""
 CHANGEABLE = ("seconds",)
 """Arguments that may change with --resume; a class of arguments may list more in its own `CHANGEABLE`."""

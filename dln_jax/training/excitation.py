@@ -22,9 +22,9 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.runs.arguments import numbers_of
 from dln_jax.runs.progress import progress
+from dln_jax.runs.report import print_numbers
 from dln_jax.runs.stored_arguments import command_folder
 from dln_jax.sizes import require_memory
-from dln_jax.training.results import print_numbers
 from dln_jax.types import InputError, require_positive
 
 VALIDATION = "validation"

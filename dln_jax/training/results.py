@@ -1,11 +1,9 @@
 """Output common to all kinds of runs: tables with units, and costs."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Column, Table
 
 from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Progress, Training
@@ -38,17 +36,6 @@ def number(metric: str, value: int | float) -> str:
     if any(word in metric for word in ("_mse", "_nmse", "_loss", "spread", "error", "eigenvalue", "condition")):
         return f"{value:.2e}"
     return f"{value:,.2f}" if "share" in metric or metric.startswith("vpt") else f"{value:,.1f}"
-
-
-def print_numbers(
-    rows: Iterable[Sequence[str]], *, title: str | None = None, columns: Sequence[str] = ("quantity", "value", "unit")
-) -> None:
-    """Prints a table of quantities, their values and units."""
-    justify = {"quantity": "left", "joint": "left", "unit": "left"}
-    table = Table(*(Column(column, justify=justify.get(column, "right")) for column in columns), title=title)  # type: ignore
-    for row in rows:
-        table.add_row(*row)
-    Console(highlight=False, soft_wrap=True).print(table)
 
 
 def one_step_metrics(latency: Latency) -> dict[str, float]:

@@ -19,6 +19,7 @@ from dln_jax.precision import data_type
 from dln_jax.rollout import rollout
 from dln_jax.runs.arguments import resolved
 from dln_jax.runs.progress import progress
+from dln_jax.runs.report import print_numbers
 from dln_jax.runs.stored_arguments import stored_arguments
 from dln_jax.sizes import require_memory, require_within
 from dln_jax.softbody.driven import Example, drive, driven_step
@@ -30,7 +31,6 @@ from dln_jax.softbody.scene import Params, State
 from dln_jax.softbody.step import Stepper
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.softbody.verdict import Info
-from dln_jax.training.results import print_numbers
 from dln_jax.training.simulation_meshes import listed, own_mesh
 from dln_jax.training.simulation_results import SimulatedMotion, draw, finite_moments, line, results, stride, warn
 from dln_jax.types import InputError, require_positive

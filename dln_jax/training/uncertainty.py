@@ -15,7 +15,7 @@ from dln_jax.learning.uncertainty import estimate
 from dln_jax.metrics.coverage import LEVEL, coverage
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.uncertainty import Uncertainty, deviation_of_rows, exceeds, scores_of_rows
-from dln_jax.training.pipeline import png
+from dln_jax.runs.report import png
 from dln_jax.types import InputError
 from dln_jax.zoo.run import load
 from dln_jax.zoo.uncertainty_files import save_uncertainty

@@ -16,7 +16,8 @@ from dln_jax.metrics.verdict import Verdict
 from dln_jax.precision import with_float64
 from dln_jax.runs.arguments import names_listed, numbers_of, refuse_given, require_positive_if_given
 from dln_jax.runs.progress import progress
-from dln_jax.training.pipeline import Fitted, Judged, Kind, png
+from dln_jax.runs.report import Report, png
+from dln_jax.training.pipeline import Fitted, Kind
 from dln_jax.training.value_figures import closed_loop, value_slice_of
 from dln_jax.training.value_plants import Chosen, Wishes, is_file_of_plant, of_file, of_run, published
 from dln_jax.training.values import (
@@ -172,16 +173,16 @@ def over_seeds(trained: Sequence[Trained]) -> dict[str, float]:
     }
 
 
-def judge(case: Case, fitted: Fitted, options: Any, folder: Path) -> Judged:
+def judge(case: Case, fitted: Fitted, options: Any, folder: Path) -> Report:
     """Returns of the law in the evaluation, whether its starts end upright, and figures."""
     run, numbers = fitted.outcome
     run = ValueRun(run.name, run.plant, run.network, with_float64(run.parameters), run.own)
     measures = measured(case.chosen, run, count=options.starts, share=case.robust)
     verdict, numbers = verdict_of(measures, options.starts), numbers | measures
     own = None if case.chosen.own is None else case.chosen.own.problem
-    return Judged(
+    return Report(
         metrics={**{key: finite(value) for key, value in numbers.items()}, "verdict": verdict.number},
-        rows=lambda _: [
+        rows=[
             (key.replace("_", " "), f"{value:.4g}", "s" if "seconds" in key else "") for key, value in numbers.items()
         ],
         title=f"returns from {options.starts} starts hanging, and anywhere",

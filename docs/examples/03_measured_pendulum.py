@@ -71,7 +71,6 @@ train_hnn_task.main(
         steps=ITERATIONS,
         out=folder / "run",
         figures=False,
-        low_latency=False,
     )
 )
 flow = dln_jax.load(folder / "run").flow

@@ -34,9 +34,7 @@ ITERATIONS, FINE_STEPS = 20, 400
 # The command line makes a run, whose folder has everything needed to rebuild the model.
 
 folder = Path(tempfile.mkdtemp()) / "run"
-options = arguments_of(
-    train_delan.Arguments, steps=ITERATIONS, out=folder, figures=False, low_latency=False, uncertainty=False
-)
+options = arguments_of(train_delan.Arguments, steps=ITERATIONS, out=folder, figures=False, uncertainty=False)
 train_delan.main(options)
 run = dln_jax.load(folder)
 count = sum(leaf.size for leaf in jax.tree.leaves(run.parameters))

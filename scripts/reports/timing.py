@@ -12,7 +12,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from dln_jax.training.low_latency_calls import last_line
 from dln_jax.types import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -80,3 +79,8 @@ def casadi():
     except ImportError as error:
         raise InputError("this measurement needs CasADi: pip install casadi") from error
     return ca
+
+
+def last_line(output: bytes) -> str:
+    """The last line of a process's output."""
+    return next(iter(reversed(output.decode(errors="replace").strip().splitlines())), "it printed nothing")

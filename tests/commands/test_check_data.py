@@ -48,7 +48,7 @@ def test_a_log_with_an_error_ends_with_status_1_and_a_whole_page(log):
 def test_missing_rates_of_a_noisy_log_come_from_filtered_q_unless_the_user_declines(log, capsys):
     errors = {}
     for name, *option in (("default",), ("raw", "--cutoff inf")):
-        fit = "--data log.npz --model trigonometric --degree 1 --test d --no-figures --no-low-latency --no-uncertainty"
+        fit = "--data log.npz --model trigonometric --degree 1 --test d --no-figures --no-uncertainty"
         with pytest.raises(SystemExit) if option else contextlib.nullcontext():
             command(train_delan, fit, *option, "--out", name)
         said = capsys.readouterr().out
@@ -85,7 +85,7 @@ def test_errors_in_a_log_stop_a_training_unless_they_are_accepted(log, capsys):
     said = refused(capsys, train_delan, given)
     assert "convert to radians" in said and "--accept-log" in said and "check_data --data degrees.npz says more" in said
     assert not Path("run").exists()
-    command(train_delan, given, "--accept-log --no-figures --no-low-latency --no-uncertainty")
+    command(train_delan, given, "--accept-log --no-figures --no-uncertainty")
     said = capsys.readouterr().out
     assert "warning: q of joint 1 goes to" in said and "error:" not in said
 

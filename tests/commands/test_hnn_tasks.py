@@ -64,7 +64,7 @@ def positions(workplace):
     return workplace
 
 
-OWN = "--task measured --data positions.npz --no-low-latency"
+OWN = "--task measured --data positions.npz"
 SLIDING = ("--needs", '{"joints": ["prismatic"]}')
 
 
@@ -81,7 +81,7 @@ def test_own_positions_train_and_resume_to_the_same_model(positions, capsys, mon
     model = positions / "whole/model.safetensors"
     stored = model.read_bytes()
     model.unlink()
-    command(train_hnn_task, "--out whole --resume --no-figures --no-low-latency")
+    command(train_hnn_task, "--out whole --resume --no-figures")
     assert model.read_bytes() == stored
     assert np.isfinite(load("whole").flow.rates(np.ones(1), np.ones(1))).all()
 

@@ -15,7 +15,7 @@ from dln_jax.training.hamiltonian.model_selection import description_of
 from dln_jax.training.hamiltonian.results import units_of_judgement
 from dln_jax.training.hamiltonian.tasks import MEASURED, Stated, problem_of
 
-TASK = "--task measured --no-low-latency --no-figures --data"
+TASK = "--task measured --no-figures --data"
 SLIDING = Needs(joints=("prismatic",))
 
 

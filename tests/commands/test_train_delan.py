@@ -18,8 +18,8 @@ from dln_jax.commands import make_data, train_delan
 from dln_jax.data import schema
 
 ROOT = Path(__file__).parents[3]
-TINY = "--optimizer adam --steps 40 --batch 64 --width 4 --depth 1 --precision f64 --no-low-latency"
-BRIEF = "--no-figures --no-low-latency --no-uncertainty"
+TINY = "--optimizer adam --steps 40 --batch 64 --width 4 --depth 1 --precision f64"
+BRIEF = "--no-figures --no-uncertainty"
 FILES = {
     ".lock",
     "config.json",
@@ -65,7 +65,7 @@ def test_a_finished_run_is_never_overwritten_and_resumes_to_itself(trained, fold
     ):
         assert words in refused(capsys, train_delan, *options)
     assert {path: path.read_bytes() for path in trained.iterdir()} == before and not (folder / "void").exists()
-    command(train_delan, "--out", trained, "--resume --no-figures --no-low-latency")
+    command(train_delan, "--out", trained, "--resume --no-figures")
     assert (trained / "model.safetensors").read_bytes() == before[trained / "model.safetensors"]
 
 
@@ -82,7 +82,7 @@ def test_a_killed_run_resumes_to_the_same_parameters(folder):
             time.sleep(0.005)
         process.kill()
     assert not (folder / "killed/model.json").exists(), "the run was over before it could be killed"
-    command(train_delan, "--out killed --resume --no-figures --no-low-latency")
+    command(train_delan, "--out killed --resume --no-figures")
     one, other = ((folder / name / "model.safetensors").read_bytes() for name in ("unbroken", "killed"))
     assert one == other
 

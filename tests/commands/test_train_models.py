@@ -1,8 +1,6 @@
 """Every model and optimiser through the command line, on a pendulum and a tiny budget."""
 
-import io
 import re
-import subprocess
 
 import numpy as np
 import pytest
@@ -14,10 +12,9 @@ from dln_jax.data import schema
 from dln_jax.learning.engine.optimisers import Adam, suited
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum
-from dln_jax.training import low_latency_calls
 from dln_jax.training.dynamics.methods import growth as dynamics_growth
 
-BRIEF = "--no-figures --no-low-latency --no-uncertainty"
+BRIEF = "--no-figures --no-uncertainty"
 QUICK = f"--data swing.npz --width 3 --depth 1 --steps 6 {BRIEF}"
 
 
@@ -36,7 +33,7 @@ def metrics_of(folder):
 
 
 def test_a_learned_tree_is_searched_for_and_is_exact(workplace, capsys):
-    options = "--data swing.npz --model learned-tree --no-figures --no-low-latency"
+    options = "--data swing.npz --model learned-tree --no-figures"
     command(train_delan, options, "--out tree")
     assert "descents" in capsys.readouterr().out
     assert metrics_of(workplace / "tree")["torque_mse"] < 1e-12
@@ -44,7 +41,7 @@ def test_a_learned_tree_is_searched_for_and_is_exact(workplace, capsys):
 
 
 def test_a_kernel_is_made_of_samples_and_its_order_is_chosen_by_validation(workplace, capsys):
-    options = "--data swing.npz --model trigonometric-kernel --no-figures --no-low-latency"
+    options = "--data swing.npz --model trigonometric-kernel --no-figures"
     command(train_delan, options, "--samples 40 --out kernel")
     said = capsys.readouterr().out
     assert re.search(r"kernel: 40 of \d+ samples", said) and "by order of the bodies: a chain: " in said
@@ -53,16 +50,10 @@ def test_a_kernel_is_made_of_samples_and_its_order_is_chosen_by_validation(workp
 
 
 @pytest.mark.as_users_compile
-def test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes(workplace, capsys, monkeypatch):
-    def answer(command, *, input, **_):
-        assert command[-1] == "inverse_dynamics" and np.load(io.BytesIO(input)).shape[1:] == (3, 1)
-        return subprocess.CompletedProcess(command, 0, b'a warning\n{"p50_us": 11.75, "p99_us": 14.5}\n', b"")
-
-    monkeypatch.setattr(low_latency_calls.subprocess, "run", answer)
+def test_the_trigonometric_model_is_exact(workplace, capsys):
     command(train_delan, "--data swing.npz --model trigonometric --no-figures --out linear")
     metrics = metrics_of(workplace / "linear")
     assert metrics["torque_mse"] < 1e-20 and metrics["one_step_p50_us"] > 0 and metrics["share_not_definite"] == 0
-    assert (metrics["one_step_low_latency_p50_us"], metrics["one_step_low_latency_p99_us"]) == (11.75, 14.5)
     assert "least squares: 6 parameters, rank" in capsys.readouterr().out
     tau = load("linear").dynamics.inverse_dynamics([0.5], [1.0], [2.0])
     # m l² qdd + m g l sin q + b qd

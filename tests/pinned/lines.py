@@ -29,7 +29,7 @@ from dln_jax.scenes.pendulums import pendulum, two_link_arm
 from dln_jax.scenes.poles import cart_pole
 
 SMALL = "--width 4 --depth 1"
-BRIEF = "--no-figures --no-low-latency --no-uncertainty"
+BRIEF = "--no-figures --no-uncertainty"
 LINES = {
     **{
         f"train_delan-{model}": f"train_delan --data arm.npz --model {model} {more} {BRIEF}"
@@ -45,13 +45,12 @@ LINES = {
     "train_delan-motors": "train_delan --data cart.npz --model structured-delan --steps 5 "
     f"--optimizer gauss-newton {SMALL} {BRIEF}",
     "train_hnn": f"train_hnn --data arm.npz --optimizer gauss-newton --steps 5 {SMALL} {BRIEF}",
-    "train_hnn_task-spring": "train_hnn_task --task spring --trajectories 10 --steps 5 --no-figures --no-low-latency",
-    "train_hnn_task-pendulum": "train_hnn_task --task pendulum --trajectories 10 --steps 5 --no-figures "
-    "--no-low-latency",
+    "train_hnn_task-spring": "train_hnn_task --task spring --trajectories 10 --steps 5 --no-figures",
+    "train_hnn_task-pendulum": "train_hnn_task --task pendulum --trajectories 10 --steps 5 --no-figures",
     "train_hnn_task-measured": "train_hnn_task --task measured --data swings.npz --test 3 --steps 5 "
-    f"--model separable-hnn {SMALL} --no-figures --no-low-latency",
+    f"--model separable-hnn {SMALL} --no-figures",
     "train_hnn_task-momenta": "train_hnn_task --task measured --data momenta.npz --test 3 --steps 5 "
-    f"--model separable-hnn {SMALL} --no-figures --no-low-latency",
+    f"--model separable-hnn {SMALL} --no-figures",
     **{
         f"identify-{name}": f"identify --robot arm.urdf --data log.npz --no-figures --no-uncertainty {more}"
         for name, more in {

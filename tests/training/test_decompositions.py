@@ -21,7 +21,7 @@ from dln_jax.runs.arguments import arguments_of
 from dln_jax.scenes.datasets.generators import characters
 from dln_jax.training.dynamics.run import prepare
 
-BRIEF = "--no-figures --no-low-latency --no-uncertainty"
+BRIEF = "--no-figures --no-uncertainty"
 PARTS = ("torque_mse", "inertial_mse", "coriolis_mse", "gravity_mse")
 LETTERS = "letters.npz"
 

@@ -13,7 +13,17 @@ from dln_jax.interrupts import held_back
 from dln_jax.learning.engine import descent, newton, optimisers
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.optimisers import Adam, Optimiser
-from dln_jax.learning.engine.problem import NO_START, Problem, Progress, Report, Stop, Training, plain, sharing, silent
+from dln_jax.learning.engine.problem import (
+    NO_START,
+    Problem,
+    Progress,
+    ProgressReport,
+    Stop,
+    Training,
+    plain,
+    sharing,
+    silent,
+)
 from dln_jax.scale.mesh import local, of_first_process, replicate
 from dln_jax.types import InputError, require_positive
 
@@ -29,7 +39,7 @@ def fit(
     optimiser: Optimiser,
     *,
     checkpoint: Checkpoint | None = None,
-    report: Report = silent,
+    report: ProgressReport = silent,
     seconds: float | int = math.inf,
     must_start: bool = True,
     mesh: Mesh | None = None,

@@ -172,7 +172,7 @@ class Training(NamedTuple):
         return plain(np.nanmin([np.full_like(values[0], np.inf, float), *values], axis=0)) if values else math.inf
 
 
-Report = Callable[[Progress], None]
+ProgressReport = Callable[[Progress], None]
 
 
 def silent(progress: Progress) -> None:

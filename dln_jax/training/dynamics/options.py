@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from dln_jax.runs.arguments import Unstated, Variants
-from dln_jax.runs.options import Devices, Drawn, Filtered, Limited, Resumable, Scaled, SingleCalls
+from dln_jax.runs.options import Devices, Drawn, Filtered, Limited, Resumable, Scaled
 
 ActivationName = Literal["tanh", "softplus", "silu", "gelu", "sin", "cos"]
 Precision = Literal["f32", "f64"]
@@ -42,7 +42,7 @@ class Plant:
 
 
 @dataclass(frozen=True)
-class Options(SingleCalls, Drawn, Resumable, Filtered, Plant):
+class Options(Drawn, Resumable, Filtered, Plant):
     """What to train on, and where the results go."""
 
     uncertainty: bool = True

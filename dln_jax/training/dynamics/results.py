@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.compilation import in_background
 from dln_jax.data.splits import merged
 from dln_jax.figures.torques import force_decomposition, tip_paths
 from dln_jax.figures.training import training_curve
@@ -19,11 +18,10 @@ from dln_jax.metrics.latency import Latency, one_step
 from dln_jax.metrics.rollouts import Motion, by_trajectory, metrics_of_motions, records_of
 from dln_jax.metrics.verdict import Verdict
 from dln_jax.precision import data_type
+from dln_jax.runs.report import png
 from dln_jax.training.dynamics.programs import Programs, judged_data
 from dln_jax.training.dynamics.task import Task
 from dln_jax.training.dynamics.verdict import judge_fit
-from dln_jax.training.low_latency_calls import low_latency_metrics
-from dln_jax.training.pipeline import png
 from dln_jax.training.results import cost_metrics, number, unit_of
 from dln_jax.training.uncertainty import uncertainty_metrics
 from dln_jax.types import InputError
@@ -68,8 +66,6 @@ MEANINGS = {
     "energy_error_j": "energy balance error of a rollout",
     "one_step_p50_us": "one call of the inverse model, median",
     "one_step_p99_us": "one call of the inverse model, 99 %",
-    "one_step_low_latency_p50_us": "one call in low-latency mode, median",
-    "one_step_low_latency_p99_us": "one call in low-latency mode, 99 %",
 }
 """Labels of metrics; other names are self-explanatory."""
 
@@ -80,19 +76,13 @@ class Evaluation(NamedTuple):
     metrics: dict[str, float | int]
     verdict: Verdict
     figures: dict[str, Callable[[Path], None]]
-    measured: Callable[[], dict[str, float]]
-    """Waits for the time of single calls in low-latency mode, which another process measures."""
 
 
-def evaluate(
-    folder: Path, task: Task, training: Training, programs: Programs, *, seeds: int, low_latency: bool
-) -> Evaluation:
+def evaluate(folder: Path, task: Task, training: Training, programs: Programs, *, seeds: int) -> Evaluation:
     """Loads the stored model as a user would and evaluates it on the test trajectories."""
     run = load(folder)
     functions, test = run.dynamics, task.sets.test
     latency = latency_of(functions, task)
-    # Another process times the low-latency mode while this one evaluates and draws.
-    timed = in_background(low_latency_metrics, folder, latency_states(task), print) if low_latency else dict
     samples = samples_of(judged_data(task), data_type(task.precision))
     answers = as_arrays(programs.predict(run.parameters, samples))
     predicted = {name: array[: len(test.t)] for name, array in answers.items()}
@@ -120,7 +110,7 @@ def evaluate(
             best_step=int(np.ravel(training.best_step)[best_seed(training, seeds, task.best)[1]]),
         ),
     }
-    return Evaluation(metrics, verdict, {**figures_of(task, training, motions, predicted), **bands}, timed)
+    return Evaluation(metrics, verdict, {**figures_of(task, training, motions, predicted), **bands})
 
 
 def best_seed(training: Training, seeds: int, best: int | None = None) -> tuple[Any, int]:
@@ -145,14 +135,10 @@ def parameters_of(training: Training, index: int) -> Any:
 
 def latency_of(functions: Dynamics | PlainDynamics, task: Task, *, calls: int = 5000) -> Latency:
     """Latency of one inverse-dynamics call."""
-    states = list(zip(*map(jnp.asarray, latency_states(task)), strict=True))
-    return one_step(functions.inverse_dynamics, states, calls=calls)
-
-
-def latency_states(task: Task) -> tuple[np.ndarray, ...]:
-    """Up to 512 test states q, qd and qdd, in the precision of the model."""
     test, dtype = task.sets.test, data_type(task.precision)
-    return tuple(np.asarray(array[:512], dtype) for array in (test.q, test.qd, test.qdd))
+    arrays = (np.asarray(array[:512], dtype) for array in (test.q, test.qd, test.qdd))
+    states = [tuple(map(jnp.asarray, state)) for state in zip(*arrays, strict=True)]  # rows of NumPy need no program
+    return one_step(functions.inverse_dynamics, states, calls=calls)
 
 
 def rollouts(parameters: Any, task: Task, programs: Programs) -> tuple[list[Motion], dict[str, float]]:

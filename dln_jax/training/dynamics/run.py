@@ -13,6 +13,7 @@ from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
 from dln_jax.models.model import Model, Parameters
 from dln_jax.runs.optimisers import name_of
+from dln_jax.runs.report import Report
 from dln_jax.scale.devices import device_lines
 from dln_jax.time_limit import deadline
 from dln_jax.training.dynamics.options import NETWORK, model_of, network_option
@@ -20,7 +21,7 @@ from dln_jax.training.dynamics.programs import Programs, programs_ahead, program
 from dln_jax.training.dynamics.recorded import read
 from dln_jax.training.dynamics.results import best_seed, columns, evaluate, rows
 from dln_jax.training.dynamics.task import Task, method_of, planned
-from dln_jax.training.pipeline import Fitted, Judged, Kind, train
+from dln_jax.training.pipeline import Fitted, Kind, train
 from dln_jax.training.results import settings_of
 from dln_jax.training.uncertainty import store_uncertainty
 from dln_jax.types import InputError
@@ -82,13 +83,13 @@ def fit(task: Task, options: Any, folder: Path, mesh: Mesh | None) -> Fitted:
     return Fitted(task.description, parameters, Outcome(task, training, ahead or programs_of(task, mesh), best))
 
 
-def judge(task: Task, fitted: Fitted, options: Any, folder: Path) -> Judged:
+def judge(task: Task, fitted: Fitted, options: Any, folder: Path) -> Report:
     """Errors, speed, uncertainty and verdict of the stored model, with the figures that apply."""
     task, training, programs, best = fitted.outcome
     if options.uncertainty:
         store_bands(folder, task, programs.double, fitted.parameters)
     seeds = getattr(options, "seeds", 1)
-    evaluation = evaluate(folder, task, training, programs, seeds=seeds, low_latency=options.low_latency)
+    evaluation = evaluate(folder, task, training, programs, seeds=seeds)
     unit = torque_scale(task.sets.train).tolist() if task.objective is SCALED_TORQUE else None
     more = {"cutoff_hz": task.recorded.cutoff, "validation_units": unit}
     chosen = {**task.description, **({} if task.solver is None else settings_of(task.solver.optimiser))}
@@ -100,12 +101,11 @@ def judge(task: Task, fitted: Fitted, options: Any, folder: Path) -> Judged:
     if task.refinement is not None:
         lines.append(task.refinement.line)
     limits = [getattr(options, name, None) for name in ("steps", "seconds")]
-    return Judged(
+    return Report(
         metrics=evaluation.metrics,
-        rows=lambda metrics: rows(metrics, task),
+        rows=rows(evaluation.metrics, task),
         title=f"test on {task.name}, {task.precision}",
         columns=columns(evaluation.metrics),
-        measured=evaluation.measured,
         verdict=evaluation.verdict,
         figures=evaluation.figures,
         chosen=chosen,

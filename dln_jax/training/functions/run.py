@@ -26,10 +26,11 @@ from dln_jax.metrics.verdict import judge as judge_columns
 from dln_jax.nn.activations import activation
 from dln_jax.runs.optimisers import name_of
 from dln_jax.runs.progress import progress
+from dln_jax.runs.report import Report, png
 from dln_jax.scale.devices import device_lines
 from dln_jax.training.functions.options import Options
 from dln_jax.training.functions.task import NAMED, Task, of_named, prepare
-from dln_jax.training.pipeline import Fitted, Judged, Kind, png
+from dln_jax.training.pipeline import Fitted, Kind
 from dln_jax.training.results import OF_LOSSES, cost_metrics, number, settings_of, unit_of
 from dln_jax.zoo.descriptions import describe
 from dln_jax.zoo.run import load
@@ -104,7 +105,7 @@ def fit(task: Task, options: Options, folder: Path, mesh: Mesh | None) -> Fitted
     return Fitted(description, layers, Outcome(network, training, trials))
 
 
-def judge(task: Task, fitted: Fitted, options: Options, folder: Path) -> Judged:
+def judge(task: Task, fitted: Fitted, options: Options, folder: Path) -> Report:
     """Loads the stored model as a user would, and evaluates it on the test samples."""
     network, training, trials = fitted.outcome
     loaded, function = load(folder), activation(network.activation)
@@ -124,9 +125,9 @@ def judge(task: Task, fitted: Fitted, options: Options, folder: Path) -> Judged:
     lines = (RELU,) if network.activation == "relu" else ()
     if training.stop.reason == "not finite":
         lines = ("the loss stopped being finite; the run keeps the best parameters before that", *lines)
-    return Judged(
+    return Report(
         metrics=metrics,
-        rows=lambda metrics: [
+        rows=[
             (key.replace("_", " "), number(key, value), unit_of(key, UNITS))
             for key, value in metrics.items()
             if key != "verdict"

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from dln_jax.runs.arguments import Unstated, Variants, choice
-from dln_jax.runs.options import Checked, Drawn, Limited, Resumable, Scaled, SingleCalls
+from dln_jax.runs.options import Checked, Drawn, Limited, Resumable, Scaled
 
 REAL, MEASURED = "real-pendulum", "measured"
 GENERATED = (
@@ -49,7 +49,7 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Options(SingleCalls, Drawn, Scaled, Limited, Resumable, Motion):
+class Options(Drawn, Scaled, Limited, Resumable, Motion):
     """What to train on, how, and where the results go."""
 
 

@@ -22,7 +22,7 @@ from dln_jax.learning import frames as learning_frames
 from dln_jax.learning.engine import fit as fitting
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.optimisers import Adam
-from dln_jax.learning.engine.problem import Progress, Report, silent
+from dln_jax.learning.engine.problem import Progress, ProgressReport, silent
 from dln_jax.learning.frames import Matching, TermWeights
 from dln_jax.metrics.frames import (
     FrameMotions,
@@ -47,6 +47,7 @@ from dln_jax.models.latent_phase import (
 from dln_jax.models.model import Parameters
 from dln_jax.runs.arguments import require_positive_if_given
 from dln_jax.runs.progress import progress
+from dln_jax.runs.report import Report, png
 from dln_jax.scenes.datasets.pendulum_frames import (
     FRAME_TIME,
     FRAMES,
@@ -57,7 +58,7 @@ from dln_jax.scenes.datasets.pendulum_frames import (
     swinging_rod,
 )
 from dln_jax.training.hamiltonian.options import ImageOptions
-from dln_jax.training.pipeline import Fitted, Judged, Kind, png
+from dln_jax.training.pipeline import Fitted, Kind
 from dln_jax.training.results import OF_LOSSES, losses
 from dln_jax.types import require_seed
 from dln_jax.zoo.descriptions import Description, build, describe
@@ -114,7 +115,7 @@ def measure_pixels(
     seed: int = 0,
     steps: int | None = None,
     checkpoint: Checkpoint | None = None,
-    report: Report = silent,
+    report: ProgressReport = silent,
 ) -> tuple[dict[str, float], SeenFrames]:
     """Trains a model; returns its test errors and times, and what figures need."""
     components = principal_components(data.train.frames, COMPONENTS)
@@ -201,7 +202,7 @@ def fit(case: Case, options: ImageOptions, folder: Path, mesh: Mesh | None) -> F
     return Fitted(description, with_components(seen.components, seen.parameters), (numbers, seen))
 
 
-def judge(case: Case, fitted: Fitted, options: ImageOptions, folder: Path) -> Judged:
+def judge(case: Case, fitted: Fitted, options: ImageOptions, folder: Path) -> Report:
     """The test errors, and figures of the predicted films."""
     numbers, seen = fitted.outcome
     figures = {}
@@ -211,9 +212,9 @@ def judge(case: Case, fitted: Fitted, options: ImageOptions, folder: Path) -> Ju
         figures = {**figures_of({case.kind: seen}, case.data), "training.png": curve}
     verdict = judge_frames(seen.motions, case.data.test)
     metrics = {key: value for key, value in numbers.items() if np.isfinite(value)}
-    return Judged(
+    return Report(
         metrics=metrics | {"verdict": verdict.number},
-        rows=lambda _: [(name.replace("_", " "), f"{value:.4g}") for name, value in numbers.items()],
+        rows=[(name.replace("_", " "), f"{value:.4g}") for name, value in numbers.items()],
         title=f"test films, {case.kind}",
         columns=("quantity", "value"),
         verdict=verdict,

@@ -14,11 +14,11 @@ from dln_jax.figures.style import TRUTH
 from dln_jax.figures.training import training_curve
 from dln_jax.metrics.latency import one_step
 from dln_jax.metrics.verdict import Verdict, judge_motions
+from dln_jax.runs.report import png
 from dln_jax.training.hamiltonian.predictions import Seen, figure_of, measured_once, samples_fitted, units_of
 from dln_jax.training.hamiltonian.stages import in_velocities
 from dln_jax.training.hamiltonian.tasks import Problem
 from dln_jax.training.hamiltonian.training import MOTIONS, RATES, Trained
-from dln_jax.training.pipeline import png
 from dln_jax.training.results import OF_LOSSES, one_step_metrics, unit_of
 from dln_jax.zoo.run import load
 

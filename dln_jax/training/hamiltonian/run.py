@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax.sharding import Mesh
 
-from dln_jax.compilation import in_background
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Progress
@@ -17,6 +16,7 @@ from dln_jax.runs.arguments import numbers_of, require_positive_if_given
 from dln_jax.runs.encoders import checked, facts, needs_from_option
 from dln_jax.runs.optimisers import optimiser_named
 from dln_jax.runs.progress import progress
+from dln_jax.runs.report import Report
 from dln_jax.scale.devices import device_lines
 from dln_jax.time_limit import deadline, seconds_left
 from dln_jax.training.hamiltonian.model_selection import PAIRWISE, choose_model, description_of
@@ -25,8 +25,7 @@ from dln_jax.training.hamiltonian.results import evaluate, figures_of, line
 from dln_jax.training.hamiltonian.stages import gauge_of, in_velocities
 from dln_jax.training.hamiltonian.tasks import Problem, Stated, problem_of
 from dln_jax.training.hamiltonian.training import MOTIONS, Trained, check, stages_of, train
-from dln_jax.training.low_latency_calls import low_latency_metrics
-from dln_jax.training.pipeline import Fitted, Judged, Kind
+from dln_jax.training.pipeline import Fitted, Kind
 from dln_jax.training.results import losses
 from dln_jax.types import InputError, require_seed
 from dln_jax.zoo.descriptions import build
@@ -117,22 +116,17 @@ def fit(case: Case, options: Any, folder: Path, mesh: Mesh | None) -> Fitted:
     return Fitted(description, trained.result.parameters, trained)
 
 
-def judge(case: Case, fitted: Fitted, options: Any, folder: Path) -> Judged:
+def judge(case: Case, fitted: Fitted, options: Any, folder: Path) -> Report:
     """Errors, speed and verdict on the predicted test motions."""
     problem, trained = case.problem, fitted.outcome
-    timed = dict
-    if options.low_latency:
-        truth = problem.truth[0]
-        timed = in_background(partial(low_latency_metrics, folder, (truth.q[0], truth.p[0]), print, function="rates"))
     metrics, seen, verdict = evaluate(folder, problem, trained)
-    return Judged(
+    return Report(
         metrics=metrics,
-        rows=lambda metrics: [line(name, value) for name, value in metrics.items() if name != "verdict"],
+        rows=[line(name, value) for name, value in metrics.items() if name != "verdict"],
         title=f"test motions of {problem.name}, f64",
         verdict=verdict,
         figures=figures_of(problem, case.description["name"], seen, trained),
         chosen=case.description,
-        measured=timed,
         lines=(trained.stopped,) if trained.stopped and not trained.diverged else (),
         ended_by_user=options.steps is not None or trained.out_of_time,
         error=f"{trained.stopped}; {folder} holds the best model before that" if trained.diverged else "",

@@ -21,7 +21,7 @@ from dln_jax.learning.engine import problem as engine
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser
-from dln_jax.learning.engine.problem import Progress, Report, Training, silent
+from dln_jax.learning.engine.problem import Progress, ProgressReport, Training, silent
 from dln_jax.learning.motions import cut_windows
 from dln_jax.learning.rates import match_linear
 from dln_jax.scale.mesh import of_first_process
@@ -104,7 +104,7 @@ def train(
     seconds: float = math.inf,
     directory: Path | None = None,
     resume: bool = False,
-    report: Report = silent,
+    report: ProgressReport = silent,
     keep: Callable[[Trained], None] | None = None,
     mesh: Mesh | None = None,
 ) -> Trained:

@@ -21,6 +21,7 @@ from dln_jax.mechanics.trees.motors import armature_matrix
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.metrics.verdict import Verdict
 from dln_jax.models.rigid_tree import pairs_of
+from dln_jax.runs.report import Report, png
 from dln_jax.training.identification.additions import (
     ADDED,
     Predict,
@@ -37,7 +38,7 @@ from dln_jax.training.identification.motions import Chosen, fit_by, motion_lines
 from dln_jax.training.identification.options import Options
 from dln_jax.training.identification.task import Case, prepare, referred, with_terms
 from dln_jax.training.identification.verdict import judged
-from dln_jax.training.pipeline import Fitted, Judged, Kind, png
+from dln_jax.training.pipeline import Fitted, Kind
 from dln_jax.training.uncertainty import uncertainty_metrics
 from dln_jax.types import InputError
 
@@ -101,7 +102,7 @@ def fit(case: Case, options: Options, folder: Path, mesh: Mesh | None) -> Fitted
     )
 
 
-def judge(case: Case, fitted: Fitted, options: Options, folder: Path) -> Judged:
+def judge(case: Case, fitted: Fitted, options: Options, folder: Path) -> Report:
     """Held-out errors, uncertainty and verdict; writes parameters, the report and the robot's file."""
     case, solution, residual, seconds, motions, choice, by_torques = fitted.outcome
     predict = predictor(case.model)
@@ -127,9 +128,9 @@ def judge(case: Case, fitted: Fitted, options: Options, folder: Path) -> Judged:
     write_bytes(folder / "report.txt", text(solution).encode())
     lines = [*case.lines, *findings(solution, case.sets.train, case.names)]
     lines += write_file(folder, options, case, solution, verdict)
-    return Judged(
+    return Report(
         metrics={**metrics, "identify_seconds": seconds},
-        rows=lambda _: rows(case, solution, predicted),
+        rows=rows(case, solution, predicted),
         title="held out: nMSE by parameters, rms error, and noise of the fit",
         columns=("joint", *(name.replace("_", " ") for name in predicted), "rms", "noise", "unit"),
         verdict=verdict,

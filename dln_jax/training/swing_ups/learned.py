@@ -13,7 +13,7 @@ from dln_jax.control.desktop_plants import DesktopPlant, model_of_plant, nominal
 from dln_jax.control.plants.exploring import Exploration, explore
 from dln_jax.control.state_space import field_of
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.engine.problem import Report, silent
+from dln_jax.learning.engine.problem import ProgressReport, silent
 from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified, learned, prepare
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.training.swing_ups.any_plant import model_of
@@ -43,7 +43,9 @@ class Errors(NamedTuple):
     acceleration_nmse: float
 
 
-def obtain(plant: DesktopPlant, model: str, recording: Trajectories, *, seed: int, report: Report = silent) -> Obtained:
+def obtain(
+    plant: DesktopPlant, model: str, recording: Trajectories, *, seed: int, report: ProgressReport = silent
+) -> Obtained:
     """The model with this name.
 
     Args:

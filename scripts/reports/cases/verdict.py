@@ -56,7 +56,7 @@ def identified(*, logs: int = 6, seed: int = 100) -> Numbers:
 def learned(*, learned: int = 2, seed: int = 100) -> Numbers:
     """Shares of the verdicts of `train_delan --model learned-tree`, without a robot's file."""
     numbers = [(number, 2) for number in range(seed, seed + learned)]
-    options = {"model": "learned-tree", "low_latency": False}
+    options = {"model": "learned-tree"}
     return shares(train_delan, "learned-tree", ("sound", *OF_TREES), numbers, **options)
 
 

@@ -52,9 +52,9 @@ def test_mistakes_are_refused_before_anything_starts(tmp_path):
 def test_jobs_are_command_lines(tmp_path):
     (tmp_path / "a.npz").touch()
     grid = grid_of(f"width=8,16 data={tmp_path}/a.npz")
-    fixed = pairs("--fixed", "low-latency=no compilation-cache=yes test=e,q")
+    fixed = pairs("--fixed", "uncertainty=no compilation-cache=yes test=e,q")
     first, second = jobs_of("train_delan", train_delan.Arguments, grid, fixed, tmp_path)
-    common = ("--no-low-latency", "--compilation-cache", "--test=e,q", "--processes=1")
+    common = ("--no-uncertainty", "--compilation-cache", "--test=e,q", "--processes=1")
     assert first.arguments == (*common, "--width=8", f"--data={tmp_path}/a.npz")
     assert second.values == {"width": "16", "data": f"{tmp_path}/a.npz"} and second.folder == tmp_path / "jobs/0001"
     assert first.resumes

@@ -1,0 +1,84 @@
+"""The end of a run: metrics.json, config.json, a printed table, the verdict and the exit status, and figures."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Column, Table
+
+from dln_jax.errors import FitRefused, InputError
+from dln_jax.files import write_figure, write_json
+from dln_jax.metrics.verdict import Verdict
+from dln_jax.runs.stored_arguments import write_config
+
+
+class Report(NamedTuple):
+    """What a run found."""
+
+    metrics: Mapping[str, float | int]
+    """Contents of metrics.json."""
+    rows: Iterable[Sequence[str]]
+    """Rows of the printed table."""
+    title: str
+    columns: tuple[str, ...] = ("quantity", "value", "unit")
+    verdict: Verdict | None = None
+    """Whether the model may be used; `None` where nothing decides it."""
+    figures: Mapping[str, Callable[[Path], None]] = {}
+    """Functions that write figures and films to a path, by file name."""
+    chosen: Mapping[str, Any] = {}
+    """Values for config.json that the fit chose from the arguments."""
+    lines: tuple[str, ...] = ()
+    """Lines below the table."""
+    ended_by_user: bool = False
+    """Whether the user's own limit of steps or time ended the training: a refused fit is then a warning."""
+    error: str = ""
+    """Why the command fails although its run folder is complete; empty if it does not."""
+
+
+def png(draw: Callable[..., Figure], *arguments: Any, **options: Any) -> Callable[[Path], None]:
+    """Function that draws a figure and writes it to a path."""
+    return lambda path: write_figure(path, draw(*arguments, **options))
+
+
+def finish(folder: Path, options: Any, report: Report) -> None:
+    """Stores and prints a report, then draws its figures unless the options decline them.
+
+    Raises:
+        InputError: a training that failed.
+        FitRefused: the model must not be used, and no limit of the user ended its training; the run folder is complete.
+    """
+    write_json(folder / "metrics.json", dict(report.metrics))
+    verdict = report.verdict
+    stored = {} if verdict is None else {"verdict": verdict._asdict()}
+    write_config(folder, options, **report.chosen, **stored)
+    print_numbers(report.rows, title=report.title, columns=report.columns)
+    for text in (*report.lines, f"run folder: {folder}"):
+        print(text)
+    refused = verdict is not None and verdict.level == "refused"
+    if verdict is not None:
+        print(verdict.line)
+    if refused and report.ended_by_user:
+        print(
+            "warning: refused, but training ended at your own limit (--steps, --iterations or --seconds), so the exit "
+            "status is 0; train longer before you use this model"
+        )
+    if getattr(options, "figures", False):
+        for name, draw in report.figures.items():
+            draw(folder / name)
+    if report.error:
+        raise InputError(report.error)
+    if refused and not report.ended_by_user:
+        raise FitRefused(verdict)
+
+
+def print_numbers(
+    rows: Iterable[Sequence[str]], *, title: str | None = None, columns: Sequence[str] = ("quantity", "value", "unit")
+) -> None:
+    """Prints a table of quantities, their values and units."""
+    justify = {"quantity": "left", "joint": "left", "unit": "left"}
+    table = Table(*(Column(column, justify=justify.get(column, "right")) for column in columns), title=title)  # type: ignore
+    for row in rows:
+        table.add_row(*row)
+    Console(highlight=False, soft_wrap=True).print(table)
