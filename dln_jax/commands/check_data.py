@@ -10,7 +10,7 @@ errors, and 0 if there are only warnings and notes.
 from dataclasses import dataclass
 from pathlib import Path
 
-from dln_jax.runs.arguments import Unstated
+from dln_jax.options import Unstated
 from dln_jax.runs.options import Drawn, Folder, Logged
 
 

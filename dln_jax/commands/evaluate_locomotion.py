@@ -8,7 +8,7 @@ without a fall, if none of them goes backwards, and refused below 50 %, with exi
 from dataclasses import dataclass
 from pathlib import Path
 
-from dln_jax.runs.arguments import Unstated
+from dln_jax.options import Unstated
 from dln_jax.runs.options import Folder
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from dln_jax.runs.arguments import Unstated, choice
+from dln_jax.options import Unstated, choice
 from dln_jax.runs.options import Drawn, Folder
 
 VALIDATION = "validation"

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from dln_jax.runs.arguments import Unstated
+from dln_jax.options import Unstated
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from dln_jax.commands import COMMANDS
-from dln_jax.runs.arguments import Unstated
+from dln_jax.options import Unstated
 from dln_jax.runs.options import Resumable
 
 

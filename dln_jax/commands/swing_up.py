@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Annotated
 
 from dln_jax.errors import InputError
-from dln_jax.runs.arguments import Unstated, choice
+from dln_jax.options import Unstated, choice
 from dln_jax.runs.options import Drawn, Folder
 
 FILES = (".xml", ".mjcf", ".urdf")

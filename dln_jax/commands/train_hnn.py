@@ -7,30 +7,19 @@ the embedded letters; a run folder gets what train_delan writes. Motions without
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
-from dln_jax.errors import InputError
-from dln_jax.training.dynamics.options import VARIANTS, Options
+from dln_jax.commands.train_delan import NetworkOptions, train
 
 
 @dataclass(frozen=True)
-class Arguments(Options):
+class Arguments(NetworkOptions):
     """What to train on, how, and where the results go."""
 
-    VARIANTS: ClassVar = VARIANTS
-    model: Literal["structured-hnn", "black-box-hnn"] = "structured-hnn"
+    model: Literal["structured-hnn", "black-box-hnn"] = "structured-hnn"  # type: ignore[assignment]
     """Model to learn."""
 
 
 def main(options: Arguments) -> None:
     """Trains and evaluates the model, and writes the run folder; `InputError` for data without tau."""
-    from dln_jax.data import schema
-    from dln_jax.runs.encoders import facts
-    from dln_jax.training.dynamics.run import run
-
-    if options.data is not None and "tau" in schema.load(options.data, **facts(options)).estimated:
-        raise InputError(
-            f"{options.data} has no tau, which train_hnn is fitted to; motions without applied forces are for "
-            f"train_hnn_task --task measured --data {options.data}"
-        )
-    run(options, "train_hnn")
+    train(options, "train_hnn")

@@ -12,7 +12,7 @@ the policy on other ground.
 from dataclasses import dataclass
 from pathlib import Path
 
-from dln_jax.runs.arguments import Unstated
+from dln_jax.options import Unstated
 from dln_jax.runs.options import Drawn, Resumable, Scaled
 from dln_jax.training.locomotion_options import LocomotionOptions
 

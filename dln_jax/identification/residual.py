@@ -20,8 +20,8 @@ from dln_jax.data.splits import Split
 from dln_jax.learning import dynamics
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.learning.model_selection import Trial, grow, segments
 from dln_jax.learning.objectives import SCALED_TORQUE, arrays, residuals
+from dln_jax.learning.select import Trial, segments, select
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.residual import ResidualParameters, frozen, make_residual, make_with_residual
 from dln_jax.types import InputError, Needs, ResidualTerm
@@ -115,7 +115,7 @@ def fit_residual(
             whole = ResidualParameters(parameters, training.parameters)
             return (both, whole, settings), errors(lambda: both.energies(whole))
 
-        chosen, trials = grow(candidates, attempt)
+        chosen, trials = select(candidates, attempt, patience=2)
     model, whole, settings = (rigid, parameters, {}) if chosen.outcome is None else chosen.outcome
     return ResidualFit(model, whole, chosen.candidate, settings, trials)
 

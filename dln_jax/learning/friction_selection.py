@@ -14,7 +14,7 @@ from jaxtyping import Float
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import BLOCKS, every, in_blocks
 from dln_jax.learning.friction_terms import Log, Terms, equations_of, link_signs, log_of, solve_terms
-from dln_jax.learning.model_selection import segments, significantly_better
+from dln_jax.learning.select import segments, significantly_better
 from dln_jax.mechanics.trees.description import Tree
 
 FOLDS = 4

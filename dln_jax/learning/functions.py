@@ -34,7 +34,7 @@ from dln_jax.learning.engine.problem import (
     silent,
     unmonitored,
 )
-from dln_jax.learning.model_selection import Trial, grow
+from dln_jax.learning.select import Trial, grow
 from dln_jax.nn import differential_mlp, ensembles
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers

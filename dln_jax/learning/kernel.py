@@ -17,8 +17,8 @@ from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.marginal_likelihood import TorqueEquations, compiled_covariance, likeliest
-from dln_jax.learning.model_selection import Trial
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
+from dln_jax.learning.select import Trial
 from dln_jax.mechanics.friction.curves import unit_force
 from dln_jax.mechanics.friction.laws import FrictionShape, coefficients_of
 from dln_jax.models.joint_friction import FrictionParameters

@@ -6,7 +6,7 @@ This works for any `Model` of that kind, such as `models.trigonometric`. Phi is 
 respect to the parameters, exact because the model is linear in them.
 
 `choose_degrees` selects the size of a trigonometric basis. One degree for all joints grows until it no longer helps
-(`learning.model_selection`). If that degree exceeds 1, every joint in turn takes the smallest degree that is not
+(`learning.select`). If that degree exceeds 1, every joint in turn takes the smallest degree that is not
 significantly worse. A joint that neither changes the mass matrix nor lifts a weight, such as an arm's first vertical
 axis, ends at degree 0, which divides the size of the basis by 2 n + 1.
 """
@@ -24,8 +24,8 @@ from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.model_selection import Trial, grow, significantly_better
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
+from dln_jax.learning.select import Trial, select, significantly_better
 from dln_jax.models.model import Model, Parameters, linearised
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
@@ -191,7 +191,8 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
         return size is not None and size <= min(MOST_PARAMETERS, train.tau.size)
 
     most = next((n - 1 for n in range(2, LARGEST_DEGREE + 1) if not fits(n)), LARGEST_DEGREE)
-    chosen, trials = grow([(n,) * d for n in range(1, most + 1)], fit, patience=1, target=target)
+    sizes = [(n,) * d for n in range(1, most + 1)]
+    chosen, trials = select(sizes, fit, patience=1, stop=lambda trial: trial.validation <= target)
     for joint in range(d if chosen.candidate[0] > 1 else 0):
         while chosen.candidate[joint] > 0:
             fewer = tuple(n - (place == joint) for place, n in enumerate(chosen.candidate))

@@ -20,7 +20,7 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from dln_jax.mechanics.friction.curves import joint_dissipation, require_shape
-from dln_jax.mechanics.friction.laws import FrictionCoefficients, FrictionShape, coefficients_of, require_laws
+from dln_jax.mechanics.friction.laws import USUAL, FrictionCoefficients, FrictionShape, coefficients_of, require_laws
 from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.motors import Pair, armature_matrix, motors_of, require_motors
@@ -28,8 +28,6 @@ from dln_jax.mechanics.trees.recursions import tree_system
 from dln_jax.models.model import Model
 from dln_jax.types import FrictionLaw, InputError
 
-USUAL: tuple[FrictionLaw, ...] = ("viscous", "coulomb", "offset")
-"""Friction laws of `friction=True`."""
 Number = float | tuple[float, ...]
 """One number for all joints, or one per joint."""
 Rows = tuple[tuple[float, ...], ...]

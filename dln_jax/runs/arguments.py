@@ -12,13 +12,11 @@ from tyro._errors import BadValue, InstantiationFailure, InvalidChoice, ParseErr
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from dln_jax.errors import InputError
+from dln_jax.options import Unstated, choice  # noqa: F401  moved
 from dln_jax.sizes import require_magnitude
 
 T = TypeVar("T")
 Arguments = TypeVar("Arguments")
-
-Unstated = Annotated[T | None, tyro.conf.arg(help_behavior_hint="")]
-"""An option that is `None` by default; its help text states the effective default."""
 
 _rules = ConstructorRegistry()
 
@@ -63,40 +61,19 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     )
 
 
-def choice(names: Iterable[str], *, several: bool = False, unstated: bool = False) -> Any:
-    """Shows the allowed names of an option in its help, for `Annotated[str, ...]`.
-
-    With `several` the option takes a list of names, by default all; `unstated` hides the default, as for `Unstated`.
-    """
-    return tyro.conf.arg(
-        metavar="{" + ",".join(names) + "}" + "[,...]" * several, help_behavior_hint="" if several or unstated else None
-    )
-
-
 class Variants(NamedTuple):
     """Options that exist only for some choices of a command, such as one model: its attribute `VARIANTS`."""
 
-    chosen: Callable[[Mapping[str, Any]], Sequence[type]]
-    """Options that were typed or stored, by name -> dataclasses of further options that they bring."""
+    chosen: Callable[[Mapping[str, Any]], type]
+    """Options that were typed or stored, by name -> the dataclass of all options for these choices."""
     known: Mapping[type, str]
-    """For each of these dataclasses, a description of the options that bring it."""
+    """For each of these dataclasses, a description of the options that choose it."""
 
 
 def arguments_for(arguments: type, stated: Mapping[str, Any]) -> type:
     """The dataclass of a command's options for the choices among them; `stated` is what was typed or stored."""
     variants: Variants | None = getattr(arguments, "VARIANTS", None)
-    if variants is None:
-        return arguments
-    defaults = {field.name: field.default for field in dataclasses.fields(arguments)}
-    return class_with(arguments, variants.chosen({**defaults, **stated}))
-
-
-def class_with(arguments: type, more: Sequence[type]) -> type:
-    """A dataclass with the fields of `arguments` and of further dataclasses."""
-    documented = {"__doc__": arguments.__doc__}
-    return dataclasses.make_dataclass(
-        arguments.__name__, [], bases=(*more, arguments), frozen=True, namespace=documented
-    )
+    return arguments if variants is None else variants.chosen(stated)
 
 
 def arguments_of(arguments: type, **stated: Any) -> Any:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from dln_jax.runs.arguments import Unstated, choice
+from dln_jax.options import Unstated, choice
 
 SCENES = (
     *("two-link-arm", "two-link-arm-hanging", "pendulum", "double-pendulum", "cart-pole", "flexible-cart-pole"),
@@ -99,8 +99,6 @@ class Filtered(Checked):
     cutoff: Unstated[str] = None
     """Low-pass q at this frequency, Hz, auto, or inf for none, and derive the rates (default: the file's; auto where
     it has none and the noise of q matters)."""
-    decimate: Unstated[int] = None
-    """With --cutoff: keep every n-th sample (default: 1)."""
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from dln_jax.runs.arguments import Unstated
+from dln_jax.options import Unstated
 
 
 @dataclass(frozen=True)

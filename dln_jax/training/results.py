@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.learning.engine.optimisers import Optimiser
+from dln_jax.learning.engine.optimisers import Optimiser, name_of
 from dln_jax.learning.engine.problem import Progress, Training
-from dln_jax.metrics.latency import Latency
-from dln_jax.runs.optimisers import name_of
+from dln_jax.learning.latency import Latency
 
 OF_LOSSES = {"error": "loss", "loss": "training loss"}
 """Labels of a curve that shows losses."""

@@ -15,7 +15,7 @@ from dln_jax.identification.report import base_rows, findings, lost, parameter_r
 from dln_jax.identification.residual import Candidate, fit_residual
 from dln_jax.identification.weighted import fit_weighted
 from dln_jax.learning.linear import fit_linear
-from dln_jax.learning.model_selection import segments
+from dln_jax.learning.select import segments
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees.description import serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters, pseudo_inertia

@@ -6,7 +6,7 @@ from calls import one_line
 
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import select
-from dln_jax.learning.model_selection import Candidate, FittedModel, grow, select_model, significantly_better
+from dln_jax.learning.select import Candidate, FittedModel, grow, select_model, significantly_better
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.models.model import Model
 from dln_jax.types import InputError

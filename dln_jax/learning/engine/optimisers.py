@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import optax
 
+from dln_jax.precision import require_float64
 from dln_jax.solvers.levenberg_marquardt import CHUNK
 from dln_jax.solvers.normal_equations import count, jacobian_bytes
 from dln_jax.types import InputError, require_positive
@@ -111,3 +112,28 @@ def suited(parameters: Any, samples: int, residuals: int) -> tuple[type[Adam] | 
         return GaussNewton, f"{size:,} parameters: the normal equations take {needed / 2**20:,.0f} MiB"
     limit = f"{MOST_PARAMETERS:,} parameters" if size > MOST_PARAMETERS else f"{MOST_BYTES / 2**30:.0f} GiB"
     return Adam, f"{size:,} parameters need {needed / 2**20:,.0f} MiB of normal equations; the limit is {limit}"
+
+
+NAMES: dict[str, type[Optimiser]] = {"adam": Adam, "gauss-newton": GaussNewton}
+
+
+def optimiser_named(name: str, *, precision: str, **settings: Any) -> Optimiser:
+    """Builds an optimiser by name. Settings that it lacks are ignored; a setting of `None` takes its default.
+
+    Raises:
+        InputError: an unknown name, a setting out of range, or Gauss-Newton in a precision other than f64.
+    """
+    if name not in NAMES:
+        raise InputError(f"optimizer is '{name}'; expected one of {', '.join(NAMES)}")
+    kind = NAMES[name]
+    if kind is GaussNewton:
+        require_float64(precision)
+    chosen = kind(**{key: settings[key] for key in kind._fields if settings.get(key) is not None})
+    check(chosen)
+    return chosen
+
+
+def name_of(optimiser: Optimiser | type[Optimiser]) -> str:
+    """The name of an optimiser in command lines."""
+    kind = optimiser if isinstance(optimiser, type) else type(optimiser)
+    return next(name for name, optimiser_kind in NAMES.items() if optimiser_kind is kind)

@@ -179,6 +179,11 @@ def silent(progress: Progress) -> None:
     """Reports nothing."""
 
 
+def losses(at: Progress) -> str:
+    """Losses for a line of progress; medians over seeds."""
+    return f"loss {np.median(at.loss):.2e}  validation {np.median(at.validation):.2e}"
+
+
 def one_after_the_other(histories: Iterable[list[Progress]]) -> list[Progress]:
     """Joins the histories of consecutive trainings; steps and seconds continue."""
     joined: list[Progress] = []

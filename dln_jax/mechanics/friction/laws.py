@@ -27,6 +27,8 @@ from typing import Any, NamedTuple, get_args
 from dln_jax.types import FrictionLaw, InputError
 
 LAWS: tuple[FrictionLaw, ...] = get_args(FrictionLaw)
+USUAL: tuple[FrictionLaw, ...] = ("viscous", "coulomb", "offset")
+"""Friction of a joint where nothing else is known."""
 
 
 class FrictionCoefficients(NamedTuple):

@@ -13,18 +13,17 @@ from dln_jax.data.functions import FunctionSamples, SampleSplit
 from dln_jax.figures import functions as drawing
 from dln_jax.figures.training import training_curve
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
-from dln_jax.learning.engine.optimisers import GaussNewton
+from dln_jax.learning.engine.optimisers import GaussNewton, name_of
 from dln_jax.learning.engine.problem import Progress, Training, one_after_the_other
 from dln_jax.learning.functions import WIDTHS, Network, grow_width
 from dln_jax.learning.functions import train as train_network
-from dln_jax.learning.model_selection import Trial
+from dln_jax.learning.latency import one_step
+from dln_jax.learning.select import Trial
 from dln_jax.learning.standardisation import layers_in_own_units, to_units
 from dln_jax.metrics.functions import QUANTITIES, Prediction, errors, predictions, typical_spread
-from dln_jax.metrics.latency import one_step
 from dln_jax.metrics.verdict import Verdict, held_out, worst
 from dln_jax.metrics.verdict import judge as judge_columns
 from dln_jax.nn.activations import activation
-from dln_jax.runs.optimisers import name_of
 from dln_jax.runs.progress import progress
 from dln_jax.runs.report import Report, png
 from dln_jax.scale.devices import device_lines

@@ -7,11 +7,10 @@ import numpy as np
 
 from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples, SampleSplit
-from dln_jax.learning.engine.optimisers import GaussNewton, Optimiser
+from dln_jax.learning.engine.optimisers import GaussNewton, Optimiser, optimiser_named
 from dln_jax.learning.functions import GAUSS_NEWTON, WIDTHS, Network, published_adam, targets
 from dln_jax.learning.standardisation import Units, own_units, standard_units, to_units
 from dln_jax.runs.arguments import resolved
-from dln_jax.runs.optimisers import optimiser_named
 from dln_jax.training.functions.options import AdamOptions, NewtonOptions
 from dln_jax.types import InputError, require_seed
 

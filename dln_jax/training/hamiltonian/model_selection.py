@@ -16,8 +16,8 @@ from dln_jax.learning import accelerations
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import loss_of
-from dln_jax.learning.model_selection import grow, segments
 from dln_jax.learning.rates import match_linear
+from dln_jax.learning.select import grow, segments
 from dln_jax.training.hamiltonian.measurements import MEASURED, forces_of
 from dln_jax.training.hamiltonian.recipes import RECIPES
 from dln_jax.training.hamiltonian.stages import IN_VELOCITIES, LINEAR, first_problem, in_velocities

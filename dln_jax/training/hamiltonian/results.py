@@ -12,7 +12,7 @@ from dln_jax.figures import animations
 from dln_jax.figures.phase_space import Field
 from dln_jax.figures.style import TRUTH
 from dln_jax.figures.training import training_curve
-from dln_jax.metrics.latency import one_step
+from dln_jax.learning.latency import one_step
 from dln_jax.metrics.verdict import Verdict, judge_motions
 from dln_jax.runs.report import png
 from dln_jax.training.hamiltonian.predictions import Seen, figure_of, measured_once, samples_fitted, units_of

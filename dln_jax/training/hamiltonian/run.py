@@ -10,11 +10,10 @@ import numpy as np
 from jax.sharding import Mesh
 
 from dln_jax.data.stated_needs import needs_from_json
-from dln_jax.learning.engine.optimisers import Optimiser
-from dln_jax.learning.engine.problem import Progress
+from dln_jax.learning.engine.optimisers import Optimiser, optimiser_named
+from dln_jax.learning.engine.problem import Progress, losses
 from dln_jax.runs.arguments import numbers_of, require_positive_if_given
 from dln_jax.runs.encoders import checked, facts, needs_from_option
-from dln_jax.runs.optimisers import optimiser_named
 from dln_jax.runs.progress import progress
 from dln_jax.runs.report import Report
 from dln_jax.scale.devices import device_lines
@@ -26,7 +25,6 @@ from dln_jax.training.hamiltonian.stages import gauge_of, in_velocities
 from dln_jax.training.hamiltonian.tasks import Problem, Stated, problem_of
 from dln_jax.training.hamiltonian.training import MOTIONS, Trained, check, stages_of, train
 from dln_jax.training.pipeline import Fitted, Kind
-from dln_jax.training.results import losses
 from dln_jax.types import InputError, require_seed
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import save

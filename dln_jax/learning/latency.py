@@ -5,7 +5,11 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.zoo.run import Run
 
 
 class Latency(NamedTuple):
@@ -38,3 +42,10 @@ def one_step(function: Callable, states: Sequence[tuple], *, calls: int = 5000, 
         nanoseconds[index] = time.perf_counter_ns() - start
     p50, p99, p999, worst = (float(time) for time in np.percentile(nanoseconds / 1e3, [50, 99, 99.9, 100]))
     return Latency(compile_seconds, p50, p99, p999, worst, calls)
+
+
+def latency_of(run: Run, data: Trajectories, *, calls: int = 5000) -> Latency:
+    """Latency of the inverse dynamics of a model, over up to 512 states of the data."""
+    arrays = (np.asarray(array[:512], run.dtype) for array in (data.q, data.qd, data.qdd))
+    states = [tuple(map(jnp.asarray, state)) for state in zip(*arrays, strict=True)]  # rows of NumPy need no program
+    return one_step(run.dynamics.inverse_dynamics, states, calls=calls)

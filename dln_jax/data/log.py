@@ -1,0 +1,248 @@
+"""Reads a log and all that is known of it: joints and terms of the plant, robot, filter, findings of the check."""
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.data import schema
+from dln_jax.data.checks.findings import Finding
+from dln_jax.data.checks.validation import quick
+from dln_jax.data.encoders.clock import clock_line
+from dln_jax.data.encoders.smoothing import Smoothed, smooth
+from dln_jax.data.robots import Robot, read_robot
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import with_joints
+from dln_jax.mechanics.friction.laws import USUAL
+from dln_jax.mechanics.lagrangian import LagrangianSystem
+from dln_jax.types import InputError, Needs
+
+NO_GRAVITY = "no-gravity"
+"""Check for torques from which a robot's controller has subtracted gravity."""
+NOISY = "raw-differences"
+"""Check for rates whose differences are dominated by the noise of q."""
+FILTERED = (
+    "qd-sign", "qd-unlike", "qd-delay", "qd-exchanged", "qdd-unit", "qdd-sign", "qdd-unlike", "qdd-delay",
+    "qdd-exchanged", NOISY, "quantisation", "jitter", "gaps", "rates", "repeated", "arrival",
+)  # fmt: skip
+"""Checks for faults that filtering q replaces or repairs."""
+SPLIT = ("split", "repeated-motions")
+"""Checks for faults that `data.splits.split_log` settles."""
+
+
+class Log(NamedTuple):
+    """Trajectories, and all that is known of them."""
+
+    name: str
+    """Name of the data in messages: the file."""
+    data: Trajectories
+    """The trajectories, filtered if `smoothed` is not `None`."""
+    needs: Needs
+    """Joints and terms of the plant."""
+    needs_origin: str
+    """Who states them."""
+    remarks: tuple[str, ...] = ()
+    """Lines on how the file was read, where rates come from, and what the check found."""
+    faults: tuple[str, ...] = ()
+    """Faults that the check found and that no filter repairs."""
+    robot: Robot | None = None
+    """The robot that moved, without gravity if tau holds none."""
+    smoothed: Smoothed | None = None
+    """The filter of q and its settings; `None` if the rates are the file's."""
+    measured: Trajectories | None = None
+    """The trajectories before the filter."""
+    plant: LagrangianSystem | None = None
+    """Energies of the true plant, if it is known."""
+    tip: Any = None
+    """q -> position [2] of the last body, m, for figures; `None` if unknown."""
+
+    @property
+    def torque(self) -> str:
+        """The torque, measured or filtered, that models are fitted to and uncertainty bands refer to."""
+        if self.smoothed is None or not self.smoothed.filtered_torque:
+            return "measured torques"
+        return f"torques low-passed at {self.smoothed.cutoff:.3g} Hz (measured ones scatter more)"
+
+    @property
+    def torque_noise(self) -> Float[np.ndarray, " d"] | None:
+        """Standard deviation of the noise of filtered torques, N m or N; `None` if they are not filtered."""
+        return None if self.smoothed is None or not self.smoothed.filtered_torque else self.smoothed.noise_tau
+
+
+def read_log(
+    path: str | Path,
+    *,
+    robot: Robot | str | Path | None = None,
+    rate: float | None = None,
+    units: Literal["si", "degrees"] | None = None,
+    joints: Sequence[str] = (),
+    topics: Sequence[str] = (),
+    torque_factor: float | Sequence[float] | Mapping[str, float] | None = None,
+    **known: Any,
+) -> Log:
+    """Reads, filters and checks a log: npz, CSV or a ROS bag.
+
+        log = read_log("mine.csv", robot="arm.urdf")
+
+    Args:
+        path: the file, or a folder of a bag.
+        robot: the robot that moved, or its URDF or MJCF file; its joints are matched by name.
+        rate: sampling rate of a file without t, Hz.
+        units: CSV: units of columns whose titles state none.
+        joints: joints to keep, in this order; "LOG=NAME" renames one.
+        topics: ROS bag: topics of joint states (default: the only one).
+        torque_factor: factor of tau, such as N m per A: one, one per joint, or by name.
+        known: needs, needs_origin, driven, cutoff, decimate, settled and accept_log, as for `log_of`.
+
+    Raises:
+        InputError: a file that is missing, damaged or of another schema; joints that are not the robot's; and as for
+            `log_of`.
+    """
+    if robot is not None and not isinstance(robot, Robot):
+        robot = read_robot(Path(robot))
+    names = () if robot is None else robot.tree.names
+    stated = {"rate": rate, "units": units, "torque_factor": torque_factor, "joints": joints, "topics": topics}
+    data = schema.load(path, **stated, robot=names)
+    return log_of(data, str(path), robot=robot, check=True, **known)
+
+
+def log_of(
+    data: Trajectories,
+    name: str,
+    *,
+    robot: Robot | None = None,
+    needs: Needs | None = None,
+    needs_origin: str = "--needs",
+    driven: bool = True,
+    cutoff: float | Literal["auto"] | None = None,
+    decimate: int = 1,
+    check: bool = False,
+    settled: Collection[str] = SPLIT,
+    accept_log: bool = False,
+    more: str = "",
+) -> Log:
+    """The log of trajectories in memory: their needs, rates of filtered q, and the findings of the check.
+
+    Args:
+        data: trajectories as read.
+        name: their name in messages.
+        robot: the robot that moved.
+        needs: joints and terms of the plant (default: those of the data, else of the robot, else revolute joints with
+            gravity; the last two with friction).
+        needs_origin: who states `needs`.
+        driven: whether the motions need torques.
+        cutoff: low-pass q at this frequency, Hz, and derive the rates; "auto" chooses it from the data, inf leaves q as
+            it is (default: the rates of the data; "auto" if it has none and the noise of q matters).
+        decimate: with a cut-off, keep every n-th sample.
+        check: whether the data are a user's, which may have faults.
+        settled: names of checks that do not matter here.
+        accept_log: continue although the check found errors.
+        more: options of `check_data` beside the file, for messages.
+
+    Raises:
+        InputError: needs, joints of the data and of the robot that contradict each other, no torques although
+            `driven`, a cut-off that the data cannot be filtered at, or a log with an error.
+    """
+    if robot is not None:
+        try:
+            data = with_joints(data, robot.tree.names)
+        except InputError as error:
+            raise InputError(str(error) if name in str(error) else f"{name}: {error}") from None
+    if driven and "tau" in data.estimated:
+        remarks = f" ({'; '.join(data.remarks)})" if data.remarks else ""
+        raise InputError(
+            f"{name}: there is no tau, which models of torques are fitted to; add the measured torques, or fit motions "
+            f"without applied forces by: python -m scripts.train_hnn_task --task measured --data {name}{remarks}"
+        )
+    needs, origin = (needs, needs_origin) if needs is not None else known_needs(data, robot)
+    if needs.degrees_of_freedom != data.degrees_of_freedom:
+        raise InputError(
+            f"{origin} has {needs.degrees_of_freedom} joints, but {name} has {data.degrees_of_freedom}; make them agree"
+        )
+    if robot is not None and needs.joints != robot.tree.joints:
+        raise InputError(
+            f"{origin} has joints {'-'.join(needs.joints)}, the robot {'-'.join(robot.tree.joints)}; make them agree"
+        )
+    data = data._replace(needs=needs)
+    findings = quick(data, robot) if check else []
+    noisy = [finding.observation for finding in findings if finding.check == NOISY and "qd" in data.estimated]
+    smoothed = None
+    if cutoff is not None or (noisy and driven):
+        try:
+            smoothed = smooth(data, None if cutoff in (None, "auto") else cutoff, decimate=decimate)
+        except InputError as error:
+            if cutoff is not None:  # otherwise the finding remains: the log is too short for a filter
+                raise InputError(f"--cutoff {cutoff}: {error}") from None
+    ignored = {*settled, *(["friction"] if needs.friction or needs.joint_friction else [])}
+    if smoothed is not None:
+        # Splines through q keep its noise.
+        ignored |= {check for check in FILTERED if check != NOISY or np.isfinite(smoothed.cutoff)}
+    findings = [finding for finding in findings if finding.check not in ignored]
+    remarks = list(preparation(data, smoothed))
+    if cutoff is None and smoothed is not None:
+        remarks.insert(0, f"q is filtered before it is differentiated: {noisy[0]} (--cutoff inf leaves q as it is)")
+    remarks += lines_on(findings, name, accept_log, f"python -m scripts.check_data --data {name}{more}")
+    if robot is not None and any(finding.check == NO_GRAVITY for finding in findings):
+        robot = robot._replace(tree=robot.tree._replace(gravity=np.zeros(3)))
+    faults = [finding for finding in findings if finding.severity != "note" and finding.check != NO_GRAVITY]
+    return Log(
+        name=name,
+        data=data if smoothed is None else smoothed.data,
+        needs=needs,
+        needs_origin=origin,
+        remarks=tuple(remarks),
+        faults=tuple(finding.observation for finding in faults),
+        robot=robot,
+        smoothed=smoothed,
+        measured=data,
+    )
+
+
+def known_needs(data: Trajectories, robot: Robot | None) -> tuple[Needs, str]:
+    """Joints and terms of a plant that nobody states, and where they come from."""
+    if data.needs is not None:
+        return data.needs, "the data file"
+    if robot is not None:
+        return robot.tree.needs._replace(joint_friction=USUAL), "the robot's file, and friction"
+    needs = Needs(joints=("revolute",) * data.degrees_of_freedom, joint_friction=USUAL)
+    return needs, "assumed: neither the file nor --needs says"
+
+
+def preparation(data: Trajectories, smoothed: Smoothed | None) -> list[str]:
+    """Lines that state how the file was read, where rates and torques come from, and how noisy they are."""
+    lines = list(data.remarks)
+    if smoothed is None:
+        if data.estimated:
+            lines.append(f"not in the data: {', '.join(data.estimated)}; rates are raw finite differences")
+        return lines
+    kept = f"{smoothed.rate / smoothed.decimate:.4g} Hz in {smoothed.parts} parts"
+    how = "given" if smoothed.choice is None else "chosen from the spectra of q"
+    lines.append(
+        f"rates: q is not filtered{', as its noise is too small' * (smoothed.choice is not None)}; splines, {kept}"
+        if np.isinf(smoothed.cutoff)
+        else f"rates: q filtered without delay at {smoothed.cutoff:.3g} Hz ({how}), {kept}"
+    )
+    torque = "filtered alike" if smoothed.filtered_torque else "not filtered"
+    sizes = [", ".join(f"{number:.2g}" for number in noise) for noise in (smoothed.noise_q, smoothed.noise_tau)]
+    lines.append(f"noise of q {sizes[0]}; of tau {sizes[1]} ({torque})")
+    if count := int((smoothed.repeats.q | smoothed.repeats.tau).sum()):
+        lines.append(f"{count} samples repeat the one before and are resampled over")
+    if smoothed.clock is not None:
+        lines.append(f"{clock_line(smoothed.clock)}; their times replace t")
+    if smoothed.left_out:
+        lines.append(f"{smoothed.left_out} segments are too short for the filter and left out")
+    return lines
+
+
+def lines_on(findings: Sequence[Finding], name: str, accept_log: bool, check_data: str) -> list[str]:
+    """A line for each finding; `InputError` if one is an error, unless the log is accepted."""
+    if not findings:
+        return []
+    errors = [f"{finding.observation}; {finding.remedy}" for finding in findings if finding.severity == "error"]
+    if errors and not accept_log:
+        raise InputError(f"{name}: {'; also '.join(errors)}; or go on with --accept-log ({check_data} says more)")
+    lines = [f"warning: {error}" for error in errors]
+    lines += [finding.line for finding in findings if finding.severity != "error"]
+    return [*lines, f"{check_data} says more"]

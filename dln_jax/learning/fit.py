@@ -1,0 +1,136 @@
+"""The result of a fit: a model with its parameters, and how it was fitted."""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.data.parts import Parts
+from dln_jax.learning import dynamics
+from dln_jax.learning.engine.optimisers import Optimiser
+from dln_jax.learning.engine.problem import Progress, Stop, Training
+from dln_jax.learning.gauges import summed_with_friction
+from dln_jax.learning.kinematics.fit import TreeFit
+from dln_jax.learning.objectives import SCALED_TORQUE, Objective
+from dln_jax.learning.uncertainty import estimate
+from dln_jax.models.model import Model, Parameters
+from dln_jax.precision import data_type
+from dln_jax.types import InputError, Needs
+from dln_jax.zoo.catalogue import CATALOGUE, Properties
+from dln_jax.zoo.descriptions import Description, build
+from dln_jax.zoo.run import Run, save
+from dln_jax.zoo.uncertainty_files import save_uncertainty
+
+
+@dataclass(frozen=True, eq=False)
+class Fit(Run):
+    """A fitted model of dynamics, with its functions and how it was fitted."""
+
+    needs: Needs = Needs(joints=("revolute",))  # noqa: RUF009  replaced by every fit
+    """Joints and terms of the model."""
+    training: Training = Training(None, [], Stop("finished", 0), 0, 0.0)  # noqa: RUF009
+    """History and stop; its parameters have a leading axis if several seeds were trained."""
+    objective: Objective = SCALED_TORQUE
+    optimiser: Optimiser | None = None
+    """`None` for a fit without iterations of an optimiser."""
+    seeds: int | tuple[int, ...] = 0
+    """One seed, or several that trained in one program."""
+    best: int = 0
+    """Index of the seed that is kept."""
+    cross_validated: bool = False
+    """Whether cross-validation chose it."""
+    search: TreeFit | None = None
+    """The search for the joint frames of a learned tree."""
+    facts: Any = None
+    """JSON values on how the uncertainty was estimated."""
+    report: Any = None
+    """The `runs.report.Report` of its evaluation."""
+
+    @property
+    def name(self) -> str:
+        """Name of the model in the catalogue."""
+        return self.description["name"]
+
+    @property
+    def properties(self) -> Properties:
+        """Properties of the model by construction."""
+        return CATALOGUE[self.name].properties
+
+    def summed(self, parts: Parts) -> list[int]:
+        """Joints, counted from 1, whose gravity and friction are known only in sum."""
+        return summed_with_friction(self.needs, parts.sets.train, network=self.optimiser is not None)
+
+    def of_seed(self, index: int) -> Parameters:
+        """Parameters of one of several seeds."""
+        if isinstance(self.seeds, int):
+            return self.training.parameters
+        return jax.tree.map(lambda leaf: leaf[index], self.training.parameters)
+
+    def save(self, folder: str | Path) -> None:
+        """Writes the model and its uncertainty into a folder, for `dln_jax.load`; replaces a model that is there."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        save(folder, self.description, self.parameters)
+        if self.uncertainty is not None:
+            save_uncertainty(folder, self.uncertainty, **(self.facts or {}))
+
+
+def fit_of(description: Description, needs: Needs, training: Training, best: int = 0, **how: Any) -> Fit:
+    """The fit of a description, from the training of its parameters; `how` are further fields."""
+    several = np.ndim(training.best_step) > 0
+    parameters = jax.tree.map(lambda leaf: leaf[best], training.parameters) if several else training.parameters
+    return Fit(build(description), parameters, description, needs=needs, training=training, best=best, **how)
+
+
+def direct_fit(
+    description: Description,
+    needs: Needs,
+    parts: Parts,
+    parameters: Parameters,
+    objective: Objective,
+    *,
+    loss: float,
+    seconds: float,
+    **how: Any,
+) -> Fit:
+    """A fit without iterations, as a training of one step."""
+    model, dtype = build(description), data_type(description["precision"])
+    parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), parameters)
+    errors = dynamics.validation_errors(model, parts.sets, parameters, objective)
+    at = Progress(1, loss, float(np.mean(errors)), float("nan"), seconds)
+    training = Training(parameters, [at], Stop("finished", 1), 1, 0.0)
+    return fit_of(description, needs, training, objective=objective, **how)
+
+
+def with_uncertainty(fit: Fit, parts: Parts, torque: str, say: Callable[[str], None]) -> Fit:
+    """Adds the uncertainty of the torques; says why if there is none."""
+    if not fit.objective.of_torques:
+        say(f"no uncertainty is stored: a {fit.name} is not fitted to torques alone")
+        return fit
+    if fit.properties.kernel:
+        say(f"no uncertainty is stored: a {fit.name} has as many parameters as data")
+        return fit
+    settings = {
+        "ridge": 0.0 if fit.properties.linear else None,
+        "negligible": 1e-12 if "tree" in fit.description else 0.0,
+    }
+    train, validation, _ = parts.sets
+    try:
+        solution = estimate(double(fit), fit.parameters, train, validation, **settings)
+    except (InputError, np.linalg.LinAlgError) as error:
+        # The model is trained, so an estimate that its data cannot provide is left out instead of refused.
+        say(f"no uncertainty is stored: {error}")
+        return fit
+    say(f"bands are of {torque}, for one more motion of the kind that was recorded")
+    facts = {"ridge": solution.ridge, "degrees_of_freedom": solution.degrees_of_freedom.tolist(), "torque": torque}
+    return dataclasses.replace(fit, uncertainty=solution.uncertainty, facts=facts)
+
+
+def double(fit: Fit) -> Model:
+    """The model of a fit in float64."""
+    return build({**fit.description, "precision": "f64"})

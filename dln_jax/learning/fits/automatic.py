@@ -1,0 +1,269 @@
+"""Model selection: fits models from the strongest prior knowledge to the weakest, and keeps one by validation.
+
+Models are compared on the validation motions by squared torque errors in units of the joints' variances, so that a
+wrist counts as much as a shoulder. Models whose mass matrices are positive definite come before others, unless they
+explain much less: without such a matrix, accelerations are wrong. The selection ends early if the errors equal the
+noise of the torques, or rounding, and when time is up. A residual network is tried once, on the model that is kept.
+"""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.data.encoders.sampling import noise_of
+from dln_jax.data.log import Log
+from dln_jax.data.parts import Parts
+from dln_jax.data.splits import every
+from dln_jax.data.splits import select as trajectories
+from dln_jax.data.stated_needs import needs_from_json
+from dln_jax.files import is_file, read_json, write_json
+from dln_jax.identification.identify import identify, parameters_of
+from dln_jax.identification.residual import fit_residual
+from dln_jax.learning.context import Context
+from dln_jax.learning.fit import Fit, direct_fit
+from dln_jax.learning.fits.tree import needs_of_tree, with_joint_laws
+from dln_jax.learning.friction import fit_friction
+from dln_jax.learning.linear import MOST_PARAMETERS, parameters_of_degree
+from dln_jax.learning.objectives import SCALED_TORQUE, require_scales, squared_torque_errors, torque_scale
+from dln_jax.learning.select import Trial, lowest, mean_of_segments, select, simplest
+from dln_jax.learning.selection import say_selection
+from dln_jax.learning.settings import Automatic, Kernel, LearnedTree, Network, Trigonometric
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.friction.laws import USUAL, FrictionShape, shape_of
+from dln_jax.mechanics.trees.description import tree_to_json
+from dln_jax.metrics.definiteness import definiteness
+from dln_jax.models.rigid_tree import RigidTreeParameters
+from dln_jax.models.serial_tree import tree_of
+from dln_jax.types import InputError, Needs
+from dln_jax.zoo.descriptions import build, describe
+from dln_jax.zoo.run import load
+
+SELECTION_SECONDS, CANDIDATE_SECONDS = 300.0, 120.0
+"""Default time limits, s: for the whole selection, and for one search or network in it."""
+MOST_SAMPLES = 4_000
+"""Largest number of samples for fitting residual networks and shapes of friction."""
+EXACT = 1e-12
+"""No further candidate is tried once the normalised error of every joint is below this."""
+LEAST_NOISE, MOST_NOISE = 0.5, 1.2
+"""Range of a joint's error, relative to the noise's share of the torque's variance, that counts as that noise. A lower
+error shows that the estimate of the noise is wrong."""
+USEFUL, PRICE = 0.25, 10.0
+"""Largest mean normalised error of a model that a verdict does not refuse, as in `metrics.verdict`, and the largest
+factor on the least mean error that a positive definite mass matrix may cost."""
+NETWORK, BESIDE = "structured-delan", "-residual"
+
+
+def fit(settings: Automatic, log: Log, parts: Parts, context: Context) -> Fit:
+    """Fits the candidates, says them in a table and returns the selected one.
+
+    The devices of a mesh share the final network; all other candidates are fitted on one device.
+
+    Raises:
+        InputError: no model could be fitted.
+    """
+    train, validation, _ = parts.sets
+    require_scales(train)
+    log = log._replace(needs=with_joint_laws(log.needs))
+    scale = np.asarray(torque_scale(train))
+    noise = noise_of(train.tau, train.trajectory)
+    share = (noise / scale) ** 2 if np.isfinite(noise).all() and noise.all() else None
+    limited = math.isfinite(context.until)
+    context = context if limited else context.within(SELECTION_SECONDS)
+    candidates = candidates_of(settings, log, parts)
+    rows: dict[str, dict[str, Any]] = {}
+    ended = ""
+
+    def attempt(name: str) -> tuple[Fit | str, np.ndarray | None]:
+        began = time.perf_counter()
+        own = context if limited else context.within(CANDIDATE_SECONDS)
+        result = stored(name, candidates[name], log, parts, own)
+        row = {"name": name, "validation_nmse": None, "worst_joint": None, "seconds": time.perf_counter() - began}
+        rows[name] = row
+        errors = None
+        if isinstance(result, Fit):
+            squares = squared_torque_errors(result.model, result.parameters, validation, scale)
+            errors = mean_of_segments(validation, squares)
+            if not np.isfinite(errors).all():
+                result, errors = "its torques are not finite on validation motions", None
+        if isinstance(result, str) or errors is None:
+            row["reason"] = result
+            context.say(f"{name}: {result}")
+            return result, None
+        nmse = squares.mean(axis=0)
+        row |= {"validation_nmse": float(nmse.mean()), "worst_joint": float(nmse.max())}
+        row |= {"joints": nmse.tolist(), "definite": is_definite(result, parts)}
+        context.say(f"{name}: validation nMSE {nmse.mean():.3g}, worst joint {nmse.max():.3g}, {row['seconds']:.1f} s")
+        return result, errors.mean(axis=1)
+
+    def stop(trial: Trial) -> bool:
+        nonlocal ended
+        row = rows[trial.candidate]
+        nmse = np.array(row["joints"])
+        if not row["definite"]:
+            return False
+        if (nmse <= EXACT).all():
+            ended = f"{trial.candidate} is exact"
+        elif share is not None and np.all((nmse >= LEAST_NOISE * share) & (nmse <= MOST_NOISE * share)):
+            ended = f"the errors of {trial.candidate} are the noise of the torques"
+        return bool(ended)
+
+    def rule(trials: Sequence[Trial]) -> Trial:
+        affordable = min(USEFUL, PRICE * lowest(trials).validation)
+        sound = [trial for trial in trials if rows[trial.candidate]["definite"] and trial.validation <= affordable]
+        return simplest(sound or trials)
+
+    names = list(candidates)
+    chosen, trials = select(names, attempt, rule=rule, until=context.until, stop=stop)
+    if not ended and len(trials) < len(names):
+        ended = f"time is out; not tried: {', '.join(names[len(trials) :])}"
+    base = chosen.outcome
+    if not ended and (base.properties.linear or base.properties.searched):
+        name = chosen.candidate + BESIDE
+        candidates[name] = lambda own: with_network(base, log, parts, own)
+        trial = Trial(name, *attempt(name))
+        chosen = rule([chosen, trial]) if trial.errors is not None else chosen
+    say_selection(context, "candidates, by errors on validation motions", chosen.candidate, ended, list(rows.values()))
+    return chosen.outcome
+
+
+Candidate = Callable[[Context], Fit | str]
+"""Context -> the fit, or the reason why there is none; an `InputError` counts as a reason."""
+
+
+def candidates_of(settings: Automatic, log: Log, parts: Parts) -> dict[str, Candidate]:
+    """The candidates by name, from the strongest prior knowledge to the weakest."""
+    known: dict[str, Candidate] = {}
+    if log.robot is not None:
+        known["rigid-tree"] = lambda context: identified(log, parts)
+    arm = LearnedTree(parents=settings.parents, kinematic_prior=settings.kinematic_prior)
+    learned: dict[str, Candidate] = {"learned-tree": lambda context: arm.fit(log, parts, context)}
+    first, second = (parameters_of_degree(log.needs, degree) for degree in (1, 2))
+    # A small basis is fitted within a second; a search for joint frames takes half a minute.
+    small = second is not None and second <= MOST_PARAMETERS
+    size = "too many" if first is None else f"{first:,}"
+    explicit: dict[str, Candidate] = {
+        "trigonometric": lambda context: (
+            Trigonometric().fit(log, parts, context)
+            if first is not None and first <= MOST_PARAMETERS
+            else f"its basis has {size} coefficients; at most {MOST_PARAMETERS:,} are tried"
+        )
+    }
+    kernel: dict[str, Candidate] = {"trigonometric-kernel": lambda context: Kernel().fit(log, parts, context)}
+    network: dict[str, Candidate] = {NETWORK: lambda context: Network().fit(log, parts, context)}
+    return known | (explicit | learned if small else learned | explicit | kernel) | network
+
+
+def stored(name: str, candidate: Candidate, log: Log, parts: Parts, context: Context) -> Fit | str:
+    """Fits a candidate and stores it in a folder of its own, or takes it from there if the run is resumed.
+
+    A learned tree is fitted again: its verdict needs the search.
+    """
+    place = None if context.folder is None else context.folder / "candidates" / name
+    done = None if place is None else place / "candidate.json"
+    if place is not None and done is not None and context.resume and is_file(done):
+        facts = read_json(done, remedy=f"remove {place}")
+        if facts.get("reason"):
+            return str(facts["reason"])
+        run = load(place)
+        needs = needs_from_json(run.description["needs"])
+        return direct(run.description, needs, parts, run.parameters, float(facts["seconds"]))
+    began = time.perf_counter()
+    try:
+        result = candidate(context)
+    except InputError as error:
+        result = str(error)
+    if place is None or done is None:
+        return result
+    place.mkdir(parents=True, exist_ok=True)
+    if isinstance(result, str):
+        write_json(done, {"reason": result})
+    else:
+        result.save(place)
+        if result.search is None:
+            write_json(done, {"seconds": time.perf_counter() - began})
+    return result
+
+
+def direct(description: dict[str, Any], needs: Needs, parts: Parts, parameters: Any, seconds: float) -> Fit:
+    """A direct fit of torques whose loss is unknown."""
+    return direct_fit(description, needs, parts, parameters, SCALED_TORQUE, loss=math.nan, seconds=seconds)
+
+
+def is_definite(result: Fit, parts: Parts) -> bool:
+    """Whether the mass matrices of a model are positive definite on validation motions; true without any."""
+    if result.properties.definite or not result.properties.energy:
+        return True
+    data = parts.sets.validation
+    with jax.enable_x64(True):
+        mechanics = dynamics(result.model.energies(result.parameters))
+        return definiteness(mechanics, data.q, data.qd).share_not_definite == 0
+
+
+def identified(log: Log, parts: Parts) -> Fit:
+    """Identifies the bodies and the friction of the robot's tree."""
+    robot, train, needs = log.robot, parts.sets.train, log.needs
+    assert robot is not None
+    began = time.perf_counter()
+    laws, tree = needs.joint_friction, robot.tree
+    shape = {"velocity_scale": needs.velocity_scale}
+    if shape_of(laws):
+        held = ("velocity_scale",) * (needs.velocity_scale != Needs(needs.joints).velocity_scale)
+        some = every(train, -(-len(train.t) // MOST_SAMPLES))
+        friction = fit_friction(tree, some, laws, shape=FrictionShape(**shape), held=held)
+        shape |= {name: values.tolist() for name, values in friction.shape.items()}
+    description = describe("rigid-tree", precision="f64", needs=needs, tree=tree_to_json(tree), **shape)
+    model = build(description)
+    known = model.init(jax.random.key(0))
+    stated = {"viscous": robot.damping, "coulomb": robot.coulomb}
+    known = known._replace(
+        **{name: jnp.asarray(values) for name, values in stated.items() if getattr(known, name) is not None}
+    )
+    solution = identify(model, known, train, joints=tree.joints)
+    parameters = parameters_of(solution.theta, known)
+    return direct(description, needs, parts, parameters, time.perf_counter() - began)
+
+
+def with_network(base: Fit, log: Log, parts: Parts, context: Context) -> Fit | str:
+    """Adds a residual network to a model if held-out motions justify it.
+
+    Its size is chosen on a part of the training set: chosen on the motions that the candidates are compared by, it
+    would fit them.
+    """
+    began, train = time.perf_counter(), parts.sets.train
+    base = as_rigid(base, log, parts) if base.properties.searched else base
+    present = np.unique(train.trajectory)
+    if len(chosen_by := present[1::4]) == 0:
+        return "a residual network takes two trajectories or blocks to fit at least; record more motions"
+    fitted = trajectories(train, np.setdiff1d(present, chosen_by))
+    added = fit_residual(
+        base.model,
+        base.parameters,
+        log.needs,
+        every(fitted, -(-len(fitted.t) // MOST_SAMPLES)),
+        trajectories(train, chosen_by),
+        seconds=min(context.seconds, CANDIDATE_SECONDS),
+    )
+    if not added.settings:
+        return "a residual network does not lower the validation error"
+    keywords = {key: value for key, value in base.description.items() if key not in ("name", "precision")}
+    description = describe(f"{base.name}{BESIDE}", precision="f64", **keywords, **added.settings)
+    return direct(description, base.needs, parts, added.parameters, time.perf_counter() - began)
+
+
+def as_rigid(learned: Fit, log: Log, parts: Parts) -> Fit:
+    """A learned tree as a rigid tree with the same frames, bodies and friction."""
+    needs, stated, solution = needs_of_tree(log.needs), learned.description, learned.parameters
+    tree = tree_of(solution, needs, parents=stated["parents"], acceleration=stated["acceleration"])
+    of_rigid = needs._replace(friction=False, joint_friction=USUAL if needs.friction else ())
+    description = describe(
+        "rigid-tree", precision="f64", needs=of_rigid, tree=tree_to_json(tree), velocity_scale=stated["velocity_scale"]
+    )
+    parameters = RigidTreeParameters(
+        solution.inertias, solution.armature, solution.viscous, solution.coulomb, solution.offset
+    )
+    return direct(description, of_rigid, parts, parameters, 0.0)

@@ -1,0 +1,167 @@
+"""Fits without iterations: models that are linear in their parameters, and Gaussian processes of energies.
+
+Validation chooses degrees, the order of the bodies, and whether friction has an offset. For other objectives than that
+of torques, Gauss-Newton refines the result.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from dln_jax.data.log import Log
+from dln_jax.data.parts import Parts
+from dln_jax.data.splits import Split
+from dln_jax.learning import dynamics
+from dln_jax.learning.context import Context
+from dln_jax.learning.engine.fit import fit as train
+from dln_jax.learning.engine.optimisers import GaussNewton
+from dln_jax.learning.engine.problem import one_after_the_other
+from dln_jax.learning.fit import Fit, direct_fit, fit_of
+from dln_jax.learning.gauges import without_offset
+from dln_jax.learning.kernel import choose_kernel, fit_kernel
+from dln_jax.learning.linear import choose_degrees, fit_linear
+from dln_jax.learning.objectives import (
+    SCALED_TORQUE,
+    TORQUE,
+    Objective,
+    objective_of,
+    squared_torque_errors,
+    torque_scale,
+)
+from dln_jax.learning.select import mean_of_segments, select
+from dln_jax.learning.settings import Goal, Kernel, Trigonometric
+from dln_jax.scale.devices import device_lines
+from dln_jax.types import InputError, Needs, require_positive
+from dln_jax.zoo.descriptions import Description, build, describe_for
+
+SAMPLES = 600
+"""Default for the largest number of samples in a kernel."""
+REFINEMENTS = 50
+"""Upper bound on the Gauss-Newton steps from a direct fit, which is near the minimum."""
+EXACT = 1e-12
+"""A fit with a smaller normalised error needs no further term."""
+
+
+def fit_basis(settings: Trigonometric, log: Log, parts: Parts, context: Context) -> Fit:
+    """Fits the trigonometric model by least squares; without a stated degree, validation chooses the degrees first."""
+    began, sets, say = time.perf_counter(), parts.sets, context.say
+    for line in device_lines(settings.precision or "f64"):
+        say(line)
+    degree: Any = 1 if settings.degree is None else settings.degree
+    description = describe_for(
+        settings.model, sets.train, log.needs, precision=settings.precision or "f64", degree=degree
+    )
+    if settings.degree is None:
+        chosen, trials = choose_degrees(log.needs, sets.train, sets.validation)
+        tried = ", ".join(f"{_degrees(trial.candidate)}: {trial.validation:.2e}" for trial in trials)
+        say(f"validation error by degrees of the joints: {tried}; chosen {_degrees(chosen.candidate)}")
+        description["degree"] = list(chosen.candidate)
+        solution = chosen.outcome
+    else:
+        solution = fit_linear(build(description), sets.train)
+    description, needs, solution = with_needed_offset(
+        description, log.needs, sets, solution, lambda lean: fit_linear(build(lean), sets.train), say
+    )
+    size = f"{solution.parameter_count} parameters, rank {solution.rank}, condition {solution.condition:.3g}"
+    say(f"least squares: {size}")
+    loss, seconds = solution.torque_mse, time.perf_counter() - began
+    return refined(direct_fit(description, needs, parts, solution.parameters, goal_of(settings, sets), loss=loss,
+                              seconds=seconds), parts, context)  # fmt: skip
+
+
+def _degrees(degrees: tuple[int, ...]) -> str:
+    return "-".join(map(str, degrees))
+
+
+def fit_energies(settings: Kernel, log: Log, parts: Parts, context: Context) -> Fit:
+    """Fits two kernels, with and without the assumption of a serial chain, and selects one by validation."""
+    began, sets, say = time.perf_counter(), parts.sets, context.say
+    for line in device_lines(settings.precision or "f64"):
+        say(line)
+    samples = SAMPLES if settings.samples is None else settings.samples
+    require_positive(samples=samples)
+    chosen, trials = choose_kernel(log.needs, sets.train, sets.validation, samples=samples)
+    size = {"samples": chosen.outcome.samples, "serial": chosen.candidate}
+    description = describe_for(settings.model, sets.train, log.needs, precision=settings.precision or "f64", **size)
+    description, needs, solution = with_needed_offset(
+        description,
+        log.needs,
+        sets,
+        chosen.outcome,
+        lambda lean: fit_kernel(without_offset(log.needs), sets.train, **size),
+        say,
+    )
+    if solution.samples < len(sets.train.tau):
+        say(f"kernel: {solution.samples} of {len(sets.train.tau)} samples, evenly spaced; --samples takes more")
+    tried = ", ".join(f"{_order(trial.candidate)}: {trial.validation:.2e}" for trial in trials)
+    say(f"validation error in units of the torques' variance by order of the bodies: {tried}")
+    noise = ", ".join(f"{sd:.2g}" for sd in solution.noise)
+    size = f"{solution.parameter_count} equations, log likelihood {solution.likelihood:.2f} by the torque"
+    say(f"kernel: {_order(chosen.candidate)}, {size}, noise of the joints {noise}")
+    loss, seconds = solution.torque_mse, time.perf_counter() - began
+    return direct_fit(description, needs, parts, solution.parameters, SCALED_TORQUE, loss=loss, seconds=seconds)
+
+
+def _order(serial: bool) -> str:
+    return "a chain" if serial else "any order"
+
+
+def goal_of(settings: Goal, sets: Split) -> Objective:
+    """The objective of the settings; torques count in units of their spread."""
+    objective = objective_of(getattr(settings, "model"), sets.train, settings.objective)  # noqa: B009
+    return SCALED_TORQUE if objective is TORQUE else objective
+
+
+def with_needed_offset(
+    description: Description,
+    needs: Needs,
+    sets: Split,
+    solution: Any,
+    refit: Callable[[Description], Any],
+    say: Callable[[str], None],
+) -> tuple[Description, Needs, Any]:
+    """Keeps the offset of friction beside a potential if validation motions need it.
+
+    Args:
+        solution: the fit with it, with `parameters`.
+        refit: description without the offset -> its fit.
+    """
+    lean = without_offset(needs)
+    if lean == needs:
+        return description, needs, solution
+    scale = np.asarray(torque_scale(sets.train))
+
+    def fitted(needs_of_trial: Needs) -> tuple[Any, np.ndarray]:
+        own = {**description, "needs": needs_of_trial._asdict()}
+        result = refit(own) if needs_of_trial == lean else solution
+        errors = squared_torque_errors(build(own), result.parameters, sets.validation, scale)
+        return (own, needs_of_trial, result), mean_of_segments(sets.validation, errors).mean(axis=1)
+
+    chosen, _ = select((lean, needs), fitted, stop=lambda trial: trial.validation <= EXACT)
+    say(f"friction kept by validation: {', '.join(chosen.candidate.joint_friction) or 'none'}")
+    return chosen.outcome
+
+
+def refined(start: Fit, parts: Parts, context: Context) -> Fit:
+    """Refines a direct fit by Gauss-Newton unless its objective is that of torques; keeps what validation prefers.
+
+    Raises:
+        InputError: the model has too many parameters for Gauss-Newton, or a precision that it does not support.
+    """
+    if start.objective.of_torques:
+        return start
+    precision = start.description["precision"]
+    suited, reason = dynamics.suited_optimiser(start.model, parts.sets, start.objective)
+    if suited is not GaussNewton or precision != "f64":
+        why = reason if precision == "f64" else "the precision is f32"
+        raise InputError(f"--objective refines a {start.name} model by Gauss-Newton in f64, but {why}; leave it out")
+    problem = dynamics.problem(start.model, parts.sets, start.objective)._replace(parameters=start.parameters)
+    refit = train(problem, GaussNewton(steps=REFINEMENTS, improvement=1e-6), seconds=context.seconds, must_start=False)
+    before = start.training
+    history = one_after_the_other([before.history, refit.history])
+    context.say(f"refined by both sides' errors: validation {before.validation:.2e}, after it {refit.validation:.2e}")
+    better = np.isfinite(refit.validation) and refit.validation < before.validation
+    training = (refit if better else before)._replace(history=history, compile_seconds=refit.compile_seconds)
+    return fit_of(start.description, start.needs, training, objective=start.objective, search=start.search)

@@ -1,0 +1,119 @@
+"""Model selection by validation: fits candidates in turn, and keeps one by a rule.
+
+A larger network always fits its training samples better, and soon fits their noise. One candidate is better than
+another if its validation error is lower by more than the standard error of their paired difference over the validation
+samples (the one-standard-error rule of Breiman et al. 1984, paired). The rule `simplest` keeps the first candidate that
+no other betters significantly.
+"""
+
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.types import InputError
+
+SEGMENT = 0.5
+"""Length in s of a segment whose mean error counts as one measurement: neighbouring samples are not independent."""
+
+
+class Trial(NamedTuple):
+    """Candidate, outcome of its fit, and validation errors."""
+
+    candidate: Any
+    outcome: Any
+    """The fit, or the reason why there is none."""
+    errors: Float[np.ndarray, " N"] | None
+    """Squared error of every validation sample; `None` without a fit."""
+
+    @property
+    def validation(self) -> float:
+        """Mean squared error; inf if there is none or it is not finite."""
+        mean = math.inf if self.errors is None else float(np.mean(self.errors))
+        return mean if np.isfinite(mean) else math.inf
+
+
+def significantly_better(
+    errors: Float[np.ndarray, " N"], others: Float[np.ndarray, " N"], *, margin: float = 1.0
+) -> bool:
+    """Whether `errors` are lower than `others` on average, by more than `margin` standard errors of the difference."""
+    if not np.isfinite(np.mean(errors)) or not np.isfinite(np.mean(others)):
+        return bool(np.isfinite(np.mean(errors)))
+    gain = others - errors
+    standard_error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0
+    return bool(gain.mean() > margin * standard_error)
+
+
+def lowest(trials: Sequence[Trial]) -> Trial:
+    """Returns the trial with the lowest validation error."""
+    return min(trials, key=lambda trial: trial.validation)
+
+
+def simplest(trials: Sequence[Trial]) -> Trial:
+    """Returns the first trial whose error no other betters significantly."""
+    best = lowest(trials)
+    return next(trial for trial in trials if not significantly_better(best.errors, trial.errors))  # type: ignore
+
+
+def select(
+    candidates: Iterable[Any],
+    fit: Callable[[Any], tuple[Any, Float[np.ndarray, " N"] | None]],
+    *,
+    rule: Callable[[Sequence[Trial]], Trial] = simplest,
+    patience: float = math.inf,
+    until: float = math.inf,
+    stop: Callable[[Trial], bool] = lambda trial: False,
+) -> tuple[Trial, list[Trial]]:
+    """Fits candidates in order; returns the chosen trial and all trials.
+
+    Args:
+        candidates: in order of size; they may depend on the trials so far.
+        fit: candidate -> outcome, and the squared error of every validation sample; or why there is no fit, and `None`.
+        rule: chooses among the trials with a fit.
+        patience: stop after this many candidates in a row without significant improvement.
+        until: reading of `time.perf_counter` after which no further candidate is tried, once one is fitted.
+        stop: whether a trial is good enough to stop at once.
+
+    Raises:
+        InputError: no candidate could be fitted.
+    """
+    trials: list[Trial] = []
+    best, waited = None, 0
+    for candidate in candidates:
+        trial = Trial(candidate, *fit(candidate))
+        trials.append(trial)
+        if trial.errors is not None:
+            if best is None or significantly_better(trial.errors, best):
+                best, waited = trial.errors, 0
+            else:
+                waited += 1
+            if waited >= patience or stop(trial):
+                break
+        if best is not None and time.perf_counter() >= until:
+            break
+    fitted = [trial for trial in trials if trial.errors is not None]
+    if not fitted or (any(trial.errors is None for trial in trials) and not np.isfinite(lowest(fitted).validation)):
+        raise InputError(
+            "no model could be fitted: " + "; ".join(f"{trial.candidate}: {trial.outcome}" for trial in trials)
+        )
+    return rule(fitted), trials
+
+
+def segments(data: Trajectories, seconds: float = SEGMENT) -> Int[np.ndarray, " N"]:
+    """Returns the index of every sample's time segment; segments end at the ends of trajectories."""
+    within = np.floor(data.t / seconds).astype(int)
+    within -= within.min()
+    _, numbers = np.unique(data.trajectory * (within.max() + 1) + within, return_inverse=True)
+    return numbers
+
+
+def mean_of_segments(data: Trajectories, errors: Float[np.ndarray, "N ..."]) -> Float[np.ndarray, "S ..."]:
+    """Means of samples' errors over their time segments."""
+    numbers = segments(data)
+    counts = np.bincount(numbers)
+    means = [np.bincount(numbers, column) / counts for column in errors.reshape(len(errors), -1).T]
+    return np.stack(means, axis=1).reshape(len(counts), *errors.shape[1:])

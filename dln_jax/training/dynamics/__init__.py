@@ -1,1 +1,0 @@
-"""Trains models of a robot's torques: options, data, model, fit and evaluation."""

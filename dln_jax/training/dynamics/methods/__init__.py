@@ -1,1 +1,0 @@
-"""The ways of fitting a model to trajectories with torques: a module each, with a `METHOD`."""
