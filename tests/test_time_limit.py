@@ -10,12 +10,10 @@ import pytest
 from dln_jax.commands import train_delan
 from dln_jax.data import schema
 from dln_jax.learning.engine.problem import Progress, Stop, Training
+from dln_jax.learning.fits import network
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import chain
 from dln_jax.time_limit import SOON, counting_from, deadline, seconds_left
-from dln_jax.training.dynamics.methods import growth as dynamics_growth
-from dln_jax.training.dynamics.methods import network
-from dln_jax.training.dynamics.methods.growth import Candidate
 from tests.calls import command
 
 
@@ -55,19 +53,17 @@ def test_growing_networks_share_one_limit(arm, clock, monkeypatch):
     """Each takes 20 s: the second ends beyond 30 s, and no third is begun."""
     left = []
 
-    def tried(task, *_, **__):
-        left.append(task.seconds)
+    def trained(plan, sets, context, **_):
+        left.append(context.seconds)
         clock.time += 20.0
-        error = 1.0 / len(left)
-        return Candidate(4, 1, 1, 10, error, 20.0, 1.0), task, training(error)
+        return training(1.0 / len(left))
 
-    def ended(*arguments, **options):
-        grow(*arguments, **options)
+    def ended(*_):
         raise Enough
 
-    grow = dynamics_growth.grow_to_target
-    monkeypatch.setattr(dynamics_growth, "_try", tried)
-    monkeypatch.setattr(network, "grow_to_target", ended)
+    monkeypatch.setattr(network, "trained", trained)
+    monkeypatch.setattr(network, "latency_of", lambda *_, **__: SimpleNamespace(p50_us=1.0))
+    monkeypatch.setattr(network, "say_selection", ended)
     with pytest.raises(Enough):
         command(train_delan, *arm, "--target", "1e-9")
     assert left == [30.0, 10.0]
@@ -85,7 +81,7 @@ def test_folds_share_the_limit_with_the_training(arm, clock, monkeypatch):
             raise Enough
         return training(np.ones(2))
 
-    monkeypatch.setattr(network, "train_problem", fit)
+    monkeypatch.setattr(network, "train", fit)
     with pytest.raises(Enough):
-        command(train_delan, *arm, "--seeds", "2", "--folds", "3")
+        command(train_delan, *arm, "--seeds", "2")
     assert limits == pytest.approx([7.5] * 4)

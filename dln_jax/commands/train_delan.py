@@ -198,7 +198,7 @@ def read(options: Options) -> Any:
     from dln_jax.data.log import log_of, read_log
     from dln_jax.data.robots import read_robot
     from dln_jax.runs.arguments import names_listed, refuse_given
-    from dln_jax.runs.logs import facts, needs_of, refuse_facts
+    from dln_jax.runs.logs import cutoff, facts, needs_of, refuse_facts
     from dln_jax.scenes.datasets.generators import CHARACTERS_TEST, default_data
     from dln_jax.scenes.pendulums import two_link_arm
     from dln_jax.scenes.registry import scene_named
@@ -212,17 +212,17 @@ def read(options: Options) -> Any:
         else:
             robot = read_robot(options.robot, lock=names_listed(options.lock))
             more = f" --robot {options.robot}" + (f" --lock '{options.lock}'" if options.lock else "")
-    if options.data is None:
-        refuse_facts(options)
-        scene = scene or two_link_arm()
-        if test is None and scene.name == "two-link-arm":
-            test = ",".join(CHARACTERS_TEST)
-    known = {"robot": robot, "needs": stated}
+    if options.data is None and scene is None:
+        scene = two_link_arm()
+    known: dict[str, Any] = {"robot": robot, "needs": stated}
     if stated is None and scene is not None:
         known |= {"needs": scene.needs, "needs_origin": f"scene {scene.name}"}
-    if options.data is None:
-        cutoff = facts(options)["cutoff"]
-        log = log_of(default_data(scene), f"default data of {scene.name}", cutoff=cutoff, **known)
-    else:
+    if options.data is not None:
         log = read_log(options.data, more=more, **facts(options), **known)
+    else:
+        assert scene is not None
+        refuse_facts(options)
+        log = log_of(default_data(scene), f"default data of {scene.name}", cutoff=cutoff(options.cutoff), **known)
+        if test is None and scene.name == "two-link-arm":
+            test = ",".join(CHARACTERS_TEST)
     return log if scene is None else log._replace(plant=scene.energies, tip=scene.tip), test

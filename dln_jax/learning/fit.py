@@ -31,6 +31,7 @@ from dln_jax.zoo.uncertainty_files import save_uncertainty
 class Fit(Run):
     """A fitted model of dynamics, with its functions and how it was fitted."""
 
+    model: Model
     needs: Needs = Needs(joints=("revolute",))  # noqa: RUF009  replaced by every fit
     """Joints and terms of the model."""
     training: Training = Training(None, [], Stop("finished", 0), 0, 0.0)  # noqa: RUF009

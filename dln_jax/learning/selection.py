@@ -1,6 +1,7 @@
 """What a model selection tells: a table of its candidates, and selection.json."""
 
 import io
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,11 +20,13 @@ def say_selection(context: Context, title: str, kept: str, ended: str, rows: Seq
         ended: why no further candidate was tried; empty if all were.
         rows: a dictionary for each candidate, with its `name`; lists and texts are not shown.
     """
-    shown = [key for key, value in rows[0].items() if key != "name"]
+    shown = [key for key in dict.fromkeys(itertools.chain(*rows)) if key not in ("name", "joints", "reason")]
     table = Table("model", *(key.replace("_", " ") for key in shown), "", title=title)
     for row in rows:
-        numbers = [f"{value:.3g}" if isinstance(value, float) else "" if value is None else f"{value}" for value in
-                   (row[key] for key in shown)]  # fmt: skip
+        values = (row.get(key) for key in shown)
+        numbers = [
+            f"{value:.3g}" if isinstance(value, float) else "" if value is None else f"{value}" for value in values
+        ]
         table.add_row(row["name"], *numbers, "kept" if row["name"] == kept else "")
     text = io.StringIO()
     Console(file=text, highlight=False, soft_wrap=True).print(table)

@@ -7,7 +7,7 @@ They are options of the commands as well. Importing this module does not import 
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from dln_jax.options import InPython, Unstated
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 ActivationName = Literal["tanh", "softplus", "silu", "gelu", "sin", "cos"]
 Precision = Literal["f32", "f64"]
-OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience")
+OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience", "rule")
 """Settings of a network that only Adam has; `samples` is that of Gauss-Newton."""
 
 
@@ -64,6 +64,8 @@ class Network(Goal):
     """adam: decoupled weight decay (default: 0.00001)."""
     patience: InPython[int | None] = None
     """adam: stop after this many steps without improvement of the validation error (default: 10000)."""
+    rule: InPython[Any] = None
+    """adam: an optax optimiser in its place."""
     folds: InPython[int] = 3
     """Folds of the cross-validation over seeds (1: use the validation motions alone)."""
 

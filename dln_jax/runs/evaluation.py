@@ -207,22 +207,24 @@ def verdict_of(
     sets, robot, numbers = parts.sets, log.robot, {}
     noise = torque_noise(sets.train) if log.torque_noise is None else log.torque_noise
     whole, names = merged(sets), None if robot is None else robot.tree.names
-    held = len(sets.test.t)
-    judged = ((slice(held), sets.test), (slice(held, None), sets.validation))
-    tested, validated = (
-        held_out(
+    count = len(sets.test.t)
+    judged = {"test": (slice(count), sets.test), "validation": (slice(count, None), sets.validation)}
+    judged = {name: (part, data) for name, (part, data) in judged.items() if len(data.t)}
+    held = {
+        name: held_out(
             answers["tau"][part],
             data.tau,
             noise=noise,
             file=None if robot is None else torques_of(robot, data),
             recording=whole.tau if parts.blocks else None,
         )
-        for part, data in judged
-    )
-    verdicts = [judge(tested, names), judge(validated, names)]
+        for name, (part, data) in judged.items()
+    }
+    verdicts = [judge(errors, names) for errors in held.values()]
     if not fit.objective.of_torques:
         recording = whole.qdd if parts.blocks else None
-        accelerations = [held_out(answers["qdd"][part], data.qdd, recording=recording) for part, data in judged]
+        pairs = judged.values()
+        accelerations = [held_out(answers["qdd"][part], data.qdd, recording=recording) for part, data in pairs]
         verdicts += [judge(errors, names, quantity="acceleration") for errors in accelerations]
     remedy = f"try another --degree, --model {'structured-hnn' if fit.properties.canonical else 'structured-delan'}, "
     remedy += "or more varied motions"
@@ -241,13 +243,12 @@ def verdict_of(
         numbers["share_not_definite"] = definite.share_not_definite
         numbers["largest_condition_number"] = definite.largest_condition_number
     if fit.search is not None:
-        of_search, found = verdict_on_search(fit.search, tested)
+        of_search, found = verdict_on_search(fit.search, held["test"])
         verdicts += [] if of_search is None else [of_search]
         numbers = found | numbers
     verdict = worst(*verdicts, causes=log.faults)
-    nmse = {f"{name}_nmse": float(np.mean(of.error / of.unit)) for name, of in
-            (("test", tested), ("validation", validated))}  # fmt: skip
-    return verdict, {**nmse, **verdict_metrics(tested, verdict), **numbers}
+    nmse = {f"{name}_nmse": float(np.mean(errors.error / errors.unit)) for name, errors in held.items()}
+    return verdict, {**nmse, **verdict_metrics(held["test"], verdict), **numbers}
 
 
 def torques_of(robot: Robot, data: Trajectories) -> np.ndarray:

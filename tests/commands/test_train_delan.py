@@ -149,7 +149,7 @@ MISTAKES = {
     "--model trigonometric --samples 9": "--samples",
     "--model trigonometric-kernel --samples 0": "samples is 0",
     "--optimizer gauss-newton --precision f32": "gauss-newton needs f64",
-    "--target 1 --width 4": "--width is what --target grows",
+    "--target 1 --width 4": "--width is for one network, and --target grows several",
     "--target 1e-8 --model black-box-delan": "--target is an option of --model structured-delan",
 }
 
@@ -174,7 +174,7 @@ def test_a_bare_recording_of_an_arm_with_friction_is_fitted_exactly_by_default(f
     assert "one recording: cut into blocks of time, 8 for training, 1 for validation, 1 for the test" in said
     assert "friction of joints: viscous, coulomb, offset" in said
     assert "verdict: good" in said and "trigonometric is exact" in said
-    metrics, stored = (json_of(folder / f"bare/{name}.json") for name in ("metrics", "model_selection"))
+    metrics, stored = (json_of(folder / f"bare/{name}.json") for name in ("metrics", "selection"))
     assert metrics["torque_mse"] < 1e-18 and metrics["verdict"] == 0 and metrics["validation_nmse"] < 1e-18
     assert stored["kept"] == "trigonometric" == load("bare").description["name"]
     assert stored["ended"] == "trigonometric is exact"

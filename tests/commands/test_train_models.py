@@ -10,9 +10,9 @@ from dln_jax import PlainDynamics, load
 from dln_jax.commands import train_delan, train_hnn
 from dln_jax.data import schema
 from dln_jax.learning.engine.optimisers import Adam, suited
+from dln_jax.learning.fits import network
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum
-from dln_jax.training.dynamics.methods import growth as dynamics_growth
 
 BRIEF = "--no-figures --no-uncertainty"
 QUICK = f"--data swing.npz --width 3 --depth 1 --steps 6 {BRIEF}"
@@ -90,12 +90,12 @@ def test_hamiltonians_are_fitted_to_momenta_or_torques(workplace, capsys):
 
 
 def test_a_target_grows_the_network_and_lists_every_candidate(workplace, capsys, monkeypatch):
-    monkeypatch.setattr(dynamics_growth, "WIDTHS", (2,))
-    monkeypatch.setattr(dynamics_growth, "DEPTHS", (1,))
+    monkeypatch.setattr(network, "WIDTHS", (2,))
+    monkeypatch.setattr(network, "DEPTHS", (1,))
     command(train_delan, "--data swing.npz --steps 2", BRIEF, "--target 1e-30 --out hard")
     assert "no candidate meets 1e-30; kept is the most accurate" in capsys.readouterr().out
-    candidates = json_of(workplace / "hard/candidates.json")["candidates"]
-    assert {(each["width"], each["networks"]) for each in candidates} == {(2, 1), (2, 2)}
+    candidates = json_of(workplace / "hard/selection.json")["candidates"]
+    assert [each["name"] for each in candidates] == ["1 x 2, one network", "1 x 2, two networks"]
     best = min(candidates, key=lambda each: each["validation_error"])
     assert metrics_of(workplace / "hard")["parameters"] == best["parameters"]
 

@@ -1,15 +1,18 @@
 """Model selection keeps the first candidate that no other betters on validation motions; every joint counts alike."""
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import numpy as np
 from calls import one_line
 
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import select
-from dln_jax.learning.select import Candidate, FittedModel, grow, select_model, significantly_better
+from dln_jax.learning.fits.automatic import compare
+from dln_jax.learning.select import select as choose
+from dln_jax.learning.select import significantly_better
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.models.model import Model
-from dln_jax.types import InputError
 
 RANDOM = np.random.default_rng(0)
 N = 120
@@ -23,60 +26,65 @@ TRAIN, VALIDATION = (select(from_arrays({**ARRAYS, **TIMES, "tau": TAU}), [index
 MASSES = Model(lambda key: jnp.ones(2), lambda masses: NaturalSystem(lambda q: jnp.diag(jnp.sqrt(masses))))
 
 
-def candidate(name, *shares):
+def candidate(*shares):
     """Masses that are wrong by these factors."""
-    return Candidate(name, lambda left: FittedModel(MASSES, jnp.asarray(UNIT * shares)))
+    return lambda: SimpleNamespace(model=MASSES, parameters=jnp.asarray(UNIT * shares))
 
 
-def refuse(left):
-    raise InputError("too large a basis")
+def compared(validation=VALIDATION, **more):
+    """The kept candidate, what is told of each, and why the comparison ended."""
+    kept, rows, ended = compare(more.pop("candidates"), TRAIN, validation, **more)
+    return kept.candidate, rows, ended
 
 
 def test_a_small_joint_counts_as_much_as_a_large_one():
-    found = select_model([candidate("large joint", 1.0, 3.0), candidate("both, nearly", 1.1, 1.1)], TRAIN, VALIDATION)
-    assert found.chosen.name == "both, nearly"
+    candidates = {"large joint": candidate(1.0, 3.0), "both, nearly": candidate(1.1, 1.1)}
+    kept, rows, _ = compared(candidates=candidates)
+    assert kept == "both, nearly"
     share = (NOISE**2 + (0.1 * UNIT) ** 2 * ARRAYS["qdd"][N:].var(axis=0)) / TAU[:N].var(axis=0)
-    assert found.chosen.nmse is not None
-    np.testing.assert_allclose(found.chosen.nmse, share, rtol=0.4)
+    np.testing.assert_allclose(rows[1]["joints"], share, rtol=0.4)
 
 
 def test_of_equals_the_first_is_chosen_and_what_cannot_be_built_says_why():
-    candidates = [
-        Candidate("refused", refuse),
-        Candidate("absent", lambda left: "no arm"),
-        candidate("true", 1, 1),
-        candidate("same", 1.001, 1),
-    ]
     told = []
-    found = select_model(candidates, TRAIN, VALIDATION, report=told.append)
-    assert found.chosen.name == "true" and found.ended == "" and list(found.steps) == told
-    assert [step.reason for step in found.steps] == ["too large a basis", "no arm", "", ""]
+    candidates = {"absent": lambda: "no arm", "true": candidate(1, 1), "same": candidate(1.001, 1)}
+    kept, rows, ended = compared(candidates=candidates, say=told.append)
+    assert kept == "true" and ended == "" and [line.partition(":")[0] for line in told] == list(candidates)
+    assert rows[0]["reason"] == "no arm" and "reason" not in rows[1]
 
 
 def test_the_search_ends_at_the_noise_and_not_where_that_is_overestimated():
-    candidates = [candidate("wrong", 2, 2), candidate("true", 1, 1), candidate("further", 1, 1)]
-    found = select_model(candidates, TRAIN, VALIDATION, noise=NOISE)
-    assert "true" in found.ended and [step.name for step in found.steps if not step.tried] == ["further"]
-    assert not select_model(candidates, TRAIN, VALIDATION, noise=3 * NOISE).ended
-    exact = VALIDATION._replace(tau=UNIT * VALIDATION.qdd)
-    assert select_model(candidates, TRAIN, exact).ended == "true is exact"
+    candidates = {"wrong": candidate(2, 2), "true": candidate(1, 1), "further": candidate(1, 1)}
+    _, rows, ended = compared(candidates=candidates, noise=NOISE)
+    assert "true" in ended and [row["name"] for row in rows] == ["wrong", "true"]
+    assert not compared(candidates=candidates, noise=3 * NOISE)[2]
+    assert compared(VALIDATION._replace(tau=UNIT * VALIDATION.qdd), candidates=candidates)[2] == "true is exact"
 
 
 def test_out_of_time_the_first_that_can_be_fitted_is_kept():
-    candidates = [Candidate("refused", refuse), candidate("first", 1, 1), candidate("second", 1, 1)]
-    found = select_model(candidates, TRAIN, VALIDATION, seconds=1e-9)
-    assert found.chosen.name == "first" and found.ended == "time is out"
-    assert found.steps[-1].reason == "time is out" and not found.steps[-1].tried
+    candidates = {"refused": lambda: "too large", "first": candidate(1, 1), "second": candidate(1, 1)}
+    kept, rows, ended = compared(candidates=candidates, until=0.0)
+    assert kept == "first" and ended == "time is out; not tried: second" and len(rows) == 2
+
+
+def test_one_more_candidate_is_made_of_the_best():
+    names = []
+
+    def beside(best):
+        names.append(float(best.parameters[0]))
+        return "better", candidate(1, 1)
+
+    assert compared(candidates={"rough": candidate(1.5, 1.5)}, beside=beside)[0] == "better" and names == [1.5]
+    assert compared(candidates={"rough": candidate(1.5, 1.5)}, beside=lambda best: None)[0] == "rough"
 
 
 def test_what_cannot_be_fitted_is_refused():
-    for tried, seconds, message in [
-        (Candidate("refused", refuse), 1.0, "no model could be fitted: refused: too large a basis"),
-        (candidate("infinite", np.inf, 1), 1.0, "not finite on validation motions"),
-        (candidate("true", 1, 1), 0.0, "seconds is 0.0"),
+    for tried, message in [
+        (lambda: "too large a basis", "no model could be fitted: alone: too large a basis"),
+        (candidate(np.inf, 1), "not finite on validation motions"),
     ]:
         with one_line(message):
-            select_model([tried], TRAIN, VALIDATION, seconds=seconds)
+            compared(candidates={"alone": tried})
 
 
 SHARED_NOISE = np.random.default_rng(1).normal(size=400) ** 2
@@ -107,8 +115,11 @@ def test_the_smallest_sufficient_candidate_is_chosen():
         ((9.0, 1.0, 0.0), 2, 2.5, 1, 2),
     ]:
         errors = [errors_of(level) for level in levels]
-        trial, trials = grow(
-            range(len(levels)), lambda n, errors=errors: (n, errors[n]), patience=patience, target=target
+        trial, trials = choose(
+            range(len(levels)),
+            lambda n, errors=errors: (n, errors[n]),
+            patience=patience,
+            stop=lambda trial, target=target: target is not None and trial.validation <= target,
         )
         assert trial.candidate == trial.outcome == chosen and len(trials) == trained, levels
 
@@ -121,10 +132,8 @@ def test_models_with_indefinite_masses_come_last_among_those_that_explain_the_to
         ((3.0, 1.1, 1.0), (1.0, 1.1), 1.0),  # the rough one explains too little to come first
         ((1.3, 1.4), (1.3,), 1.4),
     ]:
-        selection = select_model(
-            [candidate(str(size), size, size) for size in sizes],
-            TRAIN,
-            VALIDATION,
+        kept, *_ = compared(
+            candidates={str(size): candidate(size, size) for size in sizes},
             definite=lambda fitted, indefinite=indefinite: float(fitted.parameters[0]) not in indefinite,
         )
-        assert selection.chosen.name == str(chosen), (sizes, indefinite)
+        assert kept == str(chosen), (sizes, indefinite)

@@ -10,14 +10,13 @@ from typing import get_args, get_type_hints
 from dln_jax.commands import COMMANDS, identify, train_delan, train_diffnet, train_hnn, train_hnn_task, train_value
 from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.identification.consistent import REGULARISATION
-from dln_jax.mechanics.friction.laws import LAWS
-from dln_jax.models.rigid_tree import USUAL
+from dln_jax.learning.settings import WAYS
+from dln_jax.mechanics.friction.laws import LAWS, USUAL
 from dln_jax.nn.activations import ALL
 from dln_jax.runs.arguments import arguments_for, resolved
 from dln_jax.runs.options import SCENES
 from dln_jax.scenes import registry
 from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS
-from dln_jax.training.dynamics.options import AUTO, FITS
 from dln_jax.training.functions import options as functions
 from dln_jax.training.functions.task import NAMED
 from dln_jax.training.hamiltonian import options as phase_spaces
@@ -55,7 +54,7 @@ def shown(options, name):
 
 def test_names_and_defaults_in_options_are_those_of_the_library():
     assert set(SCENES) == set(registry.SCENES)
-    assert set(FITS) - {AUTO} <= set(CATALOGUE)
+    assert set(WAYS) - {"auto"} <= set(CATALOGUE)
     assert set(phase_spaces.GENERATED) == set(PROTOCOLS)
     assert set(functions.NAMES) == set(NAMED)
     assert set(identification.IDENTIFIED) == set(LAWS)
@@ -68,8 +67,7 @@ def test_names_and_defaults_in_options_are_those_of_the_library():
 
 def test_an_option_exists_for_the_choices_that_read_it():
     for command, stated, present, absent in [
-        (train_delan, {}, "width target scene", "batch samples robot degree"),
-        (train_delan, {"optimizer": "adam"}, "batch width", "samples"),
+        (train_delan, {}, "width target scene batch", "robot degree"),
         (train_delan, {"data": "log.npz"}, "robot parents seconds", "width optimizer"),
         (train_delan, {"model": "trigonometric"}, "degree objective", "width seconds seeds"),
         (train_hnn_task, {}, "trajectories width", "data noise learning_rate degree"),
@@ -84,7 +82,7 @@ def test_an_option_exists_for_the_choices_that_read_it():
 def test_every_model_of_a_command_has_a_method():
     for command in (train_delan, train_hnn):
         names = re.findall(r"'([\w-]+)'", repr(command.Arguments.__annotations__["model"]))
-        assert names and set(names) <= set(FITS)
+        assert names and set(names) <= set(WAYS)
 
 
 def test_a_zero_that_was_stated_is_no_default():

@@ -1,6 +1,5 @@
 """Parts of a torque: those that data determine are right by default, and a run says which are known only in sum."""
 
-import json
 from pathlib import Path
 
 import jax
@@ -13,13 +12,15 @@ from motions import sums_of_sines
 from dln_jax import Needs
 from dln_jax.commands import train_delan
 from dln_jax.data import schema
+from dln_jax.data.log import read_log
+from dln_jax.data.parts import split_log
 from dln_jax.data.schema import from_arrays
+from dln_jax.learning.fits.network import planned
 from dln_jax.learning.gauges import summed_with_friction
+from dln_jax.learning.settings import Network
 from dln_jax.mechanics import lagrangian
-from dln_jax.models.rigid_tree import USUAL
-from dln_jax.runs.arguments import arguments_of
+from dln_jax.mechanics.friction.laws import USUAL
 from dln_jax.scenes.datasets.generators import characters
-from dln_jax.training.dynamics.run import prepare
 
 BRIEF = "--no-figures --no-uncertainty"
 PARTS = ("torque_mse", "inertial_mse", "coriolis_mse", "gravity_mse")
@@ -67,12 +68,15 @@ def test_dry_friction_of_a_slide_that_moves_one_way_is_known_only_with_its_weigh
 
 
 def test_friction_beside_the_potential_of_a_network_has_no_offset(workplace):
-    weightless = json.dumps({"joints": ["revolute"] * 2, "gravity": False, "joint_friction": USUAL})
+    weightless = Needs(("revolute",) * 2, gravity=False, joint_friction=USUAL)
     for needs, laws in ((None, ("viscous", "coulomb")), (weightless, USUAL)):
-        options = arguments_of(train_delan.Arguments, model="structured-delan", data=Path(LETTERS), needs=needs)
-        task = prepare(options)
-        assert task.needs.joint_friction == laws and task.summed == []
-        assert tuple(task.description["needs"]["joint_friction"]) == laws
+        log = read_log(LETTERS, needs=needs)
+        parts = split_log(log)
+        plan = planned(Network(), log, parts, 0)
+        assert (
+            plan.needs.joint_friction == laws and summed_with_friction(plan.needs, parts.sets.train, network=True) == []
+        )
+        assert tuple(plan.description["needs"]["joint_friction"]) == laws
 
 
 def test_joints_whose_potential_takes_a_constant():

@@ -4,13 +4,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax import LagrangianSystem, Needs, dynamics
+from dln_jax.data.log import Log
+from dln_jax.data.parts import Parts
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import Split, select
+from dln_jax.learning.fit import Fit
 from dln_jax.learning.objectives import CANONICAL, STATED
 from dln_jax.metrics.rollouts import Motion
-from dln_jax.training.dynamics.recorded import Recorded
-from dln_jax.training.dynamics.task import Task
-from dln_jax.training.dynamics.verdict import judge_fit
+from dln_jax.models.model import Model
+from dln_jax.runs.evaluation import verdict_of as verdict_and_metrics
 
 N = 300
 OBJECTIVES = {**STATED, "momenta": CANONICAL}
@@ -26,11 +28,11 @@ ANSWERS = {key: np.concatenate([getattr(SETS.test, key), getattr(SETS.validation
 
 def verdict_of(inertia=lambda q: jnp.ones(()), *, objective="inverse", motions=(), causes=(), **changes):
     """The verdict on a model with this inertia, whose answers are exact but for the changes."""
-    needs = Needs(joints=("revolute",))
-    recorded = Recorded("log", SETS, None, needs, "the test", (), None, None, None, None, causes=causes)
-    task = Task(recorded, "black-box-delan", {}, OBJECTIVES[objective], None, 0, np.inf)
-    functions = dynamics(LagrangianSystem(lambda q, qd: inertia(q[0]) * qd[0] ** 2 / 2))
-    verdict, metrics = judge_fit(task, functions, ANSWERS | changes, list(motions))
+    log = Log("log", DATA, Needs(joints=("revolute",)), "the test", faults=causes)
+    system = LagrangianSystem(lambda q, qd: inertia(q[0]) * qd[0] ** 2 / 2)
+    model, description = Model(lambda key: (), lambda parameters: system), {"name": "black-box-delan"}
+    fit = Fit(model, (), description, objective=OBJECTIVES[objective])
+    verdict, metrics = verdict_and_metrics(fit, dynamics(system), Parts(SETS), log, ANSWERS | changes, list(motions))
     assert metrics["verdict"] == verdict.number and {"test_nmse", "validation_nmse"} <= set(metrics)
     return verdict
 

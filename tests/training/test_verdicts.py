@@ -1,9 +1,11 @@
 """Verdicts beyond errors on held-out motions: agreement of descents, heavy bodies, friction, spikes."""
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from dln_jax.metrics.verdict import HeldOut
-from dln_jax.training.dynamics.verdict import searched
+from dln_jax.runs.evaluation import verdict_on_search
 from dln_jax.training.identification.verdict import friction_verdict, spikes, weight_verdict
 
 
@@ -19,7 +21,8 @@ def test_learned_tree_says_how_its_frames_were_found():
     ]:
         known = None if noise is None else np.full(2, noise)
         held_out = HeldOut(np.full(2, error), np.ones(2), np.ones(2), known)
-        verdict, numbers = searched(np.arange(31.0), agreeing, 5, held_out)
+        search = SimpleNamespace(losses=np.arange(31.0), agreeing=agreeing, agreement=5, twin=None)
+        verdict, numbers = verdict_on_search(search, held_out)
         assert numbers["descents"] == 31 and numbers["descents_agreeing"] == agreeing
         assert said in verdict.reason and verdict.level == "doubtful" if said else verdict is None
 

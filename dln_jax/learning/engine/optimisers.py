@@ -41,6 +41,8 @@ class Adam(NamedTuple):
     """Learning rate after the last step, as a share of the peak."""
     steps_per_dispatch: int = 200
     """Steps between two scores; rounded up to whole epochs."""
+    rule: optax.GradientTransformation | None = None
+    """Another optimiser of optax in place of AdamW and its schedule, in memory only."""
 
 
 class GaussNewton(NamedTuple):
@@ -86,7 +88,9 @@ def check(optimiser: Optimiser) -> None:
 
 
 def transformation(adam: Adam) -> optax.GradientTransformation:
-    """AdamW with these settings."""
+    """AdamW with these settings, or the stated rule."""
+    if adam.rule is not None:
+        return adam.rule
     rate = adam.learning_rate
     if (adam.warm_up_share, adam.final_share) != (0, 1):
         warm_up = max(1, round(adam.warm_up_share * adam.steps))

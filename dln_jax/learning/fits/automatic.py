@@ -8,16 +8,18 @@ noise of the torques, or rounding, and when time is up. A residual network is tr
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from dln_jax.data.encoders.sampling import noise_of
 from dln_jax.data.log import Log
 from dln_jax.data.parts import Parts
+from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import every
 from dln_jax.data.splits import select as trajectories
 from dln_jax.data.stated_needs import needs_from_json
@@ -69,42 +71,94 @@ def fit(settings: Automatic, log: Log, parts: Parts, context: Context) -> Fit:
     train, validation, _ = parts.sets
     require_scales(train)
     log = log._replace(needs=with_joint_laws(log.needs))
-    scale = np.asarray(torque_scale(train))
     noise = noise_of(train.tau, train.trajectory)
-    share = (noise / scale) ** 2 if np.isfinite(noise).all() and noise.all() else None
     limited = math.isfinite(context.until)
     context = context if limited else context.within(SELECTION_SECONDS)
-    candidates = candidates_of(settings, log, parts)
-    rows: dict[str, dict[str, Any]] = {}
-    ended = ""
 
-    def attempt(name: str) -> tuple[Fit | str, np.ndarray | None]:
+    def bound(name: str, candidate: Candidate) -> Callable[[], Fit | str]:
+        return lambda: stored(name, candidate, parts, context if limited else context.within(CANDIDATE_SECONDS))
+
+    def beside(base: Fit) -> tuple[str, Callable[[], Fit | str]] | None:
+        if not (base.properties.linear or base.properties.searched):
+            return None
+        name = base.name + BESIDE
+        return name, bound(name, lambda own: with_network(base, log, parts, own))
+
+    chosen, rows, ended = compare(
+        {name: bound(name, candidate) for name, candidate in candidates_of(settings, log, parts).items()},
+        train,
+        validation,
+        noise=noise if np.isfinite(noise).all() and noise.all() else None,
+        until=context.until,
+        definite=lambda result: is_definite(result, parts),
+        beside=beside,
+        say=context.say,
+    )
+    say_selection(context, "candidates, by errors on validation motions", chosen.candidate, ended, rows)
+    return chosen.outcome
+
+
+def compare(
+    candidates: Mapping[str, Callable[[], Any]],
+    train: Trajectories,
+    validation: Trajectories,
+    *,
+    noise: Float[np.ndarray, " d"] | None = None,
+    until: float = math.inf,
+    definite: Callable[[Any], bool] = lambda result: True,
+    beside: Callable[[Any], tuple[str, Callable[[], Any]] | None] = lambda result: None,
+    say: Callable[[str], None] = lambda line: None,
+) -> tuple[Trial, list[dict[str, Any]], str]:
+    """Fits candidates in order; chooses the first that no other betters significantly, definite ones before others.
+
+    Returns the chosen trial, a row on each candidate that was tried, and why the comparison ended, if it did early.
+
+    Args:
+        candidates: name -> function that returns a model with parameters, or the reason why there is none; most
+            structured first.
+        train: samples that they are fitted to; the variances of their torques are the units of the errors.
+        validation: other motions.
+        noise: standard deviation of the joints' torque noise, N m or N, if known; the comparison ends at such errors.
+        until: reading of `time.perf_counter` after which no further candidate is tried, once one is fitted.
+        definite: whether a model's mass matrix is positive definite; true for models without one.
+        beside: chosen model -> one more candidate made of it, tried unless the comparison has ended.
+        say: takes a line on each candidate.
+
+    Raises:
+        InputError: torques that do not vary, or no candidate that could be fitted.
+    """
+    scale, rows, ended = np.asarray(torque_scale(train)), {}, ""
+    share = None if noise is None else (noise / scale) ** 2
+    every_candidate = dict(candidates)
+
+    def attempt(name: str) -> tuple[Any, np.ndarray | None]:
         began = time.perf_counter()
-        own = context if limited else context.within(CANDIDATE_SECONDS)
-        result = stored(name, candidates[name], log, parts, own)
-        row = {"name": name, "validation_nmse": None, "worst_joint": None, "seconds": time.perf_counter() - began}
-        rows[name] = row
-        errors = None
-        if isinstance(result, Fit):
+        result = every_candidate[name]()
+        seconds, errors = time.perf_counter() - began, None
+        if not isinstance(result, str):
             squares = squared_torque_errors(result.model, result.parameters, validation, scale)
             errors = mean_of_segments(validation, squares)
-            if not np.isfinite(errors).all():
-                result, errors = "its torques are not finite on validation motions", None
-        if isinstance(result, str) or errors is None:
-            row["reason"] = result
-            context.say(f"{name}: {result}")
-            return result, None
-        nmse = squares.mean(axis=0)
-        row |= {"validation_nmse": float(nmse.mean()), "worst_joint": float(nmse.max())}
-        row |= {"joints": nmse.tolist(), "definite": is_definite(result, parts)}
-        context.say(f"{name}: validation nMSE {nmse.mean():.3g}, worst joint {nmse.max():.3g}, {row['seconds']:.1f} s")
-        return result, errors.mean(axis=1)
+            if np.isfinite(errors).all():
+                nmse = squares.mean(axis=0)
+                rows[name] = {
+                    "name": name,
+                    "validation_nmse": float(nmse.mean()),
+                    "worst_joint": float(nmse.max()),
+                    "seconds": seconds,
+                    "definite": definite(result),
+                    "joints": nmse.tolist(),
+                }
+                say(f"{name}: validation nMSE {nmse.mean():.3g}, worst joint {nmse.max():.3g}, {seconds:.1f} s")
+                return result, errors.mean(axis=1)
+            result = "its torques are not finite on validation motions"
+        rows[name] = {"name": name, "validation_nmse": None, "seconds": seconds, "reason": result}
+        say(f"{name}: {result}")
+        return result, None
 
     def stop(trial: Trial) -> bool:
         nonlocal ended
-        row = rows[trial.candidate]
-        nmse = np.array(row["joints"])
-        if not row["definite"]:
+        nmse = np.array(rows[trial.candidate]["joints"])
+        if not rows[trial.candidate]["definite"]:
             return False
         if (nmse <= EXACT).all():
             ended = f"{trial.candidate} is exact"
@@ -117,18 +171,15 @@ def fit(settings: Automatic, log: Log, parts: Parts, context: Context) -> Fit:
         sound = [trial for trial in trials if rows[trial.candidate]["definite"] and trial.validation <= affordable]
         return simplest(sound or trials)
 
-    names = list(candidates)
-    chosen, trials = select(names, attempt, rule=rule, until=context.until, stop=stop)
-    if not ended and len(trials) < len(names):
-        ended = f"time is out; not tried: {', '.join(names[len(trials) :])}"
-    base = chosen.outcome
-    if not ended and (base.properties.linear or base.properties.searched):
-        name = chosen.candidate + BESIDE
-        candidates[name] = lambda own: with_network(base, log, parts, own)
-        trial = Trial(name, *attempt(name))
+    chosen, trials = select(list(candidates), attempt, rule=rule, until=until, stop=stop)
+    left = list(candidates)[len(trials) :]
+    if left and not ended:
+        ended = f"time is out; not tried: {', '.join(left)}"
+    if not ended and (more := beside(chosen.outcome)) is not None:
+        every_candidate.update([more])
+        trial = Trial(more[0], *attempt(more[0]))
         chosen = rule([chosen, trial]) if trial.errors is not None else chosen
-    say_selection(context, "candidates, by errors on validation motions", chosen.candidate, ended, list(rows.values()))
-    return chosen.outcome
+    return chosen, list(rows.values()), ended
 
 
 Candidate = Callable[[Context], Fit | str]
@@ -158,7 +209,7 @@ def candidates_of(settings: Automatic, log: Log, parts: Parts) -> dict[str, Cand
     return known | (explicit | learned if small else learned | explicit | kernel) | network
 
 
-def stored(name: str, candidate: Candidate, log: Log, parts: Parts, context: Context) -> Fit | str:
+def stored(name: str, candidate: Candidate, parts: Parts, context: Context) -> Fit | str:
     """Fits a candidate and stores it in a folder of its own, or takes it from there if the run is resumed.
 
     A learned tree is fitted again: its verdict needs the search.

@@ -83,14 +83,16 @@ def fit_energies(settings: Kernel, log: Log, parts: Parts, context: Context) -> 
     samples = SAMPLES if settings.samples is None else settings.samples
     require_positive(samples=samples)
     chosen, trials = choose_kernel(log.needs, sets.train, sets.validation, samples=samples)
-    size = {"samples": chosen.outcome.samples, "serial": chosen.candidate}
-    description = describe_for(settings.model, sets.train, log.needs, precision=settings.precision or "f64", **size)
+    order, count = chosen.candidate, chosen.outcome.samples
+    description = describe_for(
+        settings.model, sets.train, log.needs, precision=settings.precision or "f64", samples=count, serial=order
+    )
     description, needs, solution = with_needed_offset(
         description,
         log.needs,
         sets,
         chosen.outcome,
-        lambda lean: fit_kernel(without_offset(log.needs), sets.train, **size),
+        lambda lean: fit_kernel(without_offset(log.needs), sets.train, samples=count, serial=order),
         say,
     )
     if solution.samples < len(sets.train.tau):
@@ -99,7 +101,7 @@ def fit_energies(settings: Kernel, log: Log, parts: Parts, context: Context) -> 
     say(f"validation error in units of the torques' variance by order of the bodies: {tried}")
     noise = ", ".join(f"{sd:.2g}" for sd in solution.noise)
     size = f"{solution.parameter_count} equations, log likelihood {solution.likelihood:.2f} by the torque"
-    say(f"kernel: {_order(chosen.candidate)}, {size}, noise of the joints {noise}")
+    say(f"kernel: {_order(order)}, {size}, noise of the joints {noise}")
     loss, seconds = solution.torque_mse, time.perf_counter() - began
     return direct_fit(description, needs, parts, solution.parameters, SCALED_TORQUE, loss=loss, seconds=seconds)
 

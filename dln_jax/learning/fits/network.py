@@ -144,13 +144,9 @@ def require_consistent(settings: Network, seed: int) -> None:
         raise InputError(f"--target is an option of --model {STRUCTURED}; add that, or leave --target out")
     if settings.optimizer == "adam" or settings.seeds > 1:
         raise InputError("--target grows one structured network by gauss-newton; leave the other options out")
-    for name, why in (
-        ("width", "what --target grows"),
-        ("depth", "what --target grows"),
-        ("samples", "for one network"),
-    ):
+    for name in ("width", "depth", "samples"):
         if getattr(settings, name) is not None:
-            raise InputError(f"--{name} is {why}; leave it out")
+            raise InputError(f"--{name} is for one network, and --target grows several; leave it out")
 
 
 def problem_of(plan: Plan, sets: Split) -> Problem:

@@ -1,0 +1,99 @@
+"""Training and evaluation from Python: what the commands do, in memory."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from dln_jax.data.log import Log, log_of, read_log
+from dln_jax.data.parts import Parts, split_log
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import Split, select_samples
+from dln_jax.data.stated_needs import needs_from_json
+from dln_jax.learning.context import Context
+from dln_jax.learning.fit import Fit, with_uncertainty
+from dln_jax.learning.settings import WAYS
+from dln_jax.runs.evaluation import evaluate as evaluate_fit
+from dln_jax.runs.report import Report
+from dln_jax.time_limit import deadline
+from dln_jax.types import InputError
+from dln_jax.zoo.run import Run, load
+
+
+def train(
+    log: Log | Trajectories | str | Path,
+    model: str = "auto",
+    *,
+    test: str | None = None,
+    seed: int = 0,
+    seconds: float | None = None,
+    uncertainty: bool = True,
+    say: Callable[[str], None] = lambda line: None,
+    **settings: Any,
+) -> Fit:
+    """Fits a model of dynamics to a log, and evaluates it on held-out motions.
+
+        fit = dln_jax.train(dln_jax.read_log("mine.csv"), seconds=60)
+        fit.report.verdict, fit.report.metrics["torque_mse"], fit.dynamics.inverse_dynamics(q, qd, qdd)
+        fit.save("runs/mine")
+
+    Args:
+        log: from `read_log`; or trajectories, or a file.
+        model: "auto" for model selection, or one of `learning.settings.WAYS`.
+        test: test trajectories, as for `data.parts.split_log`.
+        seed: seed of parameters, shuffling and the validation split.
+        seconds: time limit of the fit.
+        uncertainty: estimate the uncertainty of the torques.
+        say: takes lines on the progress, such as `print`.
+        settings: fields of the model's class in `learning.settings`, such as `width`. The `optimizer` of a network may
+            be any of optax: `optimizer=optax.adam(3e-4), steps=5000`.
+
+    Raises:
+        InputError: JAX without float64, an unknown model or setting, or data that the model cannot be fitted to.
+    """
+    if not jax.config.values["jax_enable_x64"]:
+        raise InputError('train computes in float64; call jax.config.update("jax_enable_x64", True) before')
+    if model not in WAYS:
+        raise InputError(f"model is {model!r:.60}; expected one of {', '.join(WAYS)}")
+    way = WAYS[model]
+    known = [field.name for field in dataclasses.fields(way) if field.name != "model"]
+    if unknown := [name for name in settings if name not in known]:
+        raise InputError(f"{model} has no setting {unknown[0]!r:.60}; expected some of {', '.join(known)}")
+    if "optimizer" in settings and not isinstance(settings["optimizer"], str):
+        settings |= {"optimizer": "adam", "rule": settings["optimizer"]}
+    log = logged(log)
+    parts = split_log(log, test, seed=seed)
+    until = math.inf if seconds is None else deadline(seconds)
+    fit = way(**{"model": model, **settings}).fit(log, parts, Context(seed, until, say))
+    if uncertainty:
+        fit = with_uncertainty(fit, parts, log.torque, say)
+    return dataclasses.replace(fit, report=evaluate_fit(fit, parts, log, say=say))
+
+
+def evaluate(run: Run | str | Path, log: Log | Trajectories | str | Path) -> Report:
+    """Evaluates a stored or fitted model on another log, all of which is the test.
+
+    Raises:
+        InputError: the model has no dynamics, or other joints than the log.
+    """
+    run = load(run) if isinstance(run, str | Path) else run
+    needs, log = needs_from_json(run.description["needs"]), logged(log)
+    if needs.joints != log.needs.joints:
+        raise InputError(
+            f"the model has the joints {'-'.join(needs.joints)}, {log.name} has {'-'.join(log.needs.joints)}; "
+            "give a log of the same plant"
+        )
+    empty = select_samples(log.data, slice(0))
+    fields = {field.name: getattr(run, field.name) for field in dataclasses.fields(Run)}
+    fit = run if isinstance(run, Fit) else Fit(**fields, needs=needs)
+    return evaluate_fit(fit, Parts(Split(log.data, empty, log.data)), log)
+
+
+def logged(log: Log | Trajectories | str | Path) -> Log:
+    """The log of a file or of trajectories; a log itself."""
+    if isinstance(log, Log):
+        return log
+    return log_of(log, "the data") if isinstance(log, Trajectories) else read_log(log)
