@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.data.checks.findings import Finding
-from dln_jax.data.checks.validation import quick
+from dln_jax.data.checks.channels import Finding
+from dln_jax.data.checks.report import quick
 from dln_jax.data.encoders.clock import clock_line
 from dln_jax.data.encoders.smoothing import Smoothed, smooth
 from dln_jax.data.robots import Robot
