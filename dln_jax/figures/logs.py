@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from dln_jax.data.checks.report import Examination
 from dln_jax.data.checks.torques import Torques
-from dln_jax.data.encoders.cutoff import Choice
+from dln_jax.data.encoders.filters import Choice
 from dln_jax.data.encoders.smoothing import Smoothed
 from dln_jax.data.schema import Trajectories
 from dln_jax.figures import style

@@ -8,7 +8,6 @@ import numpy as np
 
 from dln_jax.data.checks.channels import Finding
 from dln_jax.data.checks.report import quick
-from dln_jax.data.encoders.clock import clock_line
 from dln_jax.data.encoders.smoothing import Smoothed, smooth
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
@@ -122,7 +121,7 @@ def preparation(data: Trajectories, filtered: Smoothed | None) -> list[str]:
     if count := int((filtered.repeats.q | filtered.repeats.tau).sum()):
         lines.append(f"{count} samples repeat the one before and are resampled over")
     if filtered.clock is not None:
-        lines.append(f"{clock_line(filtered.clock)}; their times replace t")
+        lines.append(f"{filtered.clock.line}; their times replace t")
     if filtered.left_out:
         lines.append(f"{filtered.left_out} segments are too short for the filter and left out")
     return lines

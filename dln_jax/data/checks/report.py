@@ -19,9 +19,7 @@ from dln_jax.data.checks.channels import (
 from dln_jax.data.checks.priors import any_energy
 from dln_jax.data.checks.torques import Torques, check_degrees, check_torques, examine_torques
 from dln_jax.data.checks.tree import OnTree, against_tree
-from dln_jax.data.encoders.clock import clock_line
-from dln_jax.data.encoders.repeats import Repeats, without_repeats
-from dln_jax.data.encoders.sampling import step_of, timing
+from dln_jax.data.encoders.sampling import Repeats, step_of, timing, without_repeats
 from dln_jax.data.encoders.smoothing import Smoothed, smooth
 from dln_jax.data.repeated_motions import motion_numbers
 from dln_jax.data.robots import Robot
@@ -119,7 +117,7 @@ def examine(data: Trajectories, robot: Robot | None = None, *, repaired: Sequenc
         even = None
     if even is not None and even.clock is not None:
         findings = [finding for finding in findings if finding.check != "jitter"]
-        findings.append(Finding("warning", "arrival", clock_line(even.clock), FILTER))
+        findings.append(Finding("warning", "arrival", even.clock.line, FILTER))
     findings += check_channels(data, None if even is None else even.data.qd)
     driven = "tau" not in data.estimated and bool(np.ptp(distinct.tau, axis=0).any())
     farthest = 0 if even is None else int(np.clip(round(FARTHEST * even.rate), 2, MOST_SHIFTS))
