@@ -52,34 +52,33 @@ class Examination(NamedTuple):
 
 
 def read(path: str | Path, **stated: Any) -> tuple[Trajectories, list[Finding]]:
-    """Reads a file as `schema.load` does, but repairs and reports samples out of order and duplicates."""
-    return schema.load_arrays(path, _from_arrays, **stated)
+    """Reads a file as `schema.load` does, but sorts samples by time, drops duplicates, and reports both."""
+    findings: list[Finding] = []
 
-
-def _from_arrays(arrays: dict[str, Any]) -> tuple[Trajectories, list[Finding]]:
-    """Groups samples by trajectory, sorts them by time and drops duplicates after the first."""
-    t, trajectory = (np.asarray(arrays.get(key, np.zeros(0))) for key in ("t", "trajectory"))
-    if t.ndim != 1 or t.shape != trajectory.shape or not np.issubdtype(t.dtype, np.number) or not len(t):
-        return schema.from_arrays(arrays), []  # which refuses them
-    order = np.lexsort((t, trajectory))
-    same = np.r_[False, (np.diff(t[order]) == 0) & (np.diff(trajectory[order]) == 0)]
-    backward, double = int(np.sum(np.diff(t)[np.diff(trajectory) == 0] < 0)), int(same.sum())
-    repaired = []
-    if backward:
-        decreases = f"t decreases at {backward} sample(s)"
-        repaired.append(Finding("error", "time-order", decreases, "sort each trajectory by time (done here)"))
-    if double:
-        repeated = f"{double} sample(s) have the time of the one before"
-        remedy = "keep one sample for each time (the first was kept here)"
-        repaired.append(Finding("error", "time-double", repeated, remedy))
-    if repaired:
-        arrays = {
+    def repair(arrays: dict[str, Any]) -> dict[str, Any]:
+        t, trajectory = (np.asarray(arrays.get(key, np.zeros(0))) for key in ("t", "trajectory"))
+        if t.ndim != 1 or t.shape != trajectory.shape or not np.issubdtype(t.dtype, np.number) or not len(t):
+            return arrays  # the schema refuses them
+        order = np.lexsort((t, trajectory))
+        same = np.r_[False, (np.diff(t[order]) == 0) & (np.diff(trajectory[order]) == 0)]
+        backward, double = int(np.sum(np.diff(t)[np.diff(trajectory) == 0] < 0)), int(same.sum())
+        if backward:
+            decreases = f"t decreases at {backward} sample(s)"
+            findings.append(Finding("error", "time-order", decreases, "sort each trajectory by time (done here)"))
+        if double:
+            repeated = f"{double} sample(s) have the time of the one before"
+            remedy = "keep one sample for each time (the first was kept here)"
+            findings.append(Finding("error", "time-double", repeated, remedy))
+        if not findings:
+            return arrays
+        per_sample = {
             key: np.asarray(array)[order[~same]]
-            if np.shape(array)[:1] == t.shape and key not in ("label", "joint_names")
-            else array
             for key, array in arrays.items()
+            if np.shape(array)[:1] == t.shape and key not in ("label", "joint_names")
         }
-    return schema.from_arrays(arrays), repaired
+        return arrays | per_sample
+
+    return schema.load(path, **stated, repair=repair), findings
 
 
 def quick(data: Trajectories, robot: Robot | None = None) -> list[Finding]:

@@ -15,7 +15,7 @@ from dln_jax.data.arrays import spread
 from dln_jax.data.bodies import find_bodies
 from dln_jax.data.encoders.smoothing import FEWEST, smooth_locally
 from dln_jax.data.repeated_motions import motion_numbers
-from dln_jax.data.schema import Trajectories, column
+from dln_jax.data.schema import Trajectories, column, time_derivative
 from dln_jax.data.splits import (
     by_motion,
     label_indices,
@@ -26,7 +26,6 @@ from dln_jax.data.splits import (
     with_joints,
 )
 from dln_jax.data.stated_tests import stated_test
-from dln_jax.data.trajectory_times import time_derivative
 from dln_jax.learning.measured_motions import MeasuredWindows, Noise
 from dln_jax.learning.motions import Weights
 from dln_jax.metrics.measured_predictions import cut_recordings, grid_places
