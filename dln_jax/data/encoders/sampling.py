@@ -98,6 +98,11 @@ def timing(t: Float[np.ndarray, " N"], trajectory: Int[np.ndarray, " N"]) -> Tim
     )
 
 
+def typical_rate(data: Trajectories) -> float:
+    """Hz, from the median step, without the rounding errors of time differences."""
+    return float(f"{timing(data.t, data.trajectory).rate:.9g}")
+
+
 def even(
     t: Float[np.ndarray, " n"], values: Float[np.ndarray, "n k"], rate: float
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
@@ -122,7 +127,7 @@ def held_at_equal_steps(data: Trajectories, rate: float | None = None) -> Trajec
         data: q, tau and the times of the samples.
         rate: rate of the equal steps, Hz (default: the median of the data).
     """
-    rate = float(f"{timing(data.t, data.trajectory).rate:.9g}") if rate is None else rate
+    rate = typical_rate(data) if rate is None else rate
     columns: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "q", "tau", "trajectory")}
     for piece in segments(data.t, data.trajectory, gap=BRIDGED):
         t, q, tau = data.t[piece], data.q[piece], data.tau[piece]

@@ -88,7 +88,6 @@ def smooth(
     data: Trajectories,
     cutoff: float | None = None,
     *,
-    rate: float | None = None,
     filter_torque: bool | None = None,
     decimate: int = 1,
     trim: float | None = None,
@@ -97,7 +96,6 @@ def smooth(
 
     Args:
         cutoff: Hz, infinite for none (default: chosen from the data, see `filters`).
-        rate: rate of the equal steps, Hz (default: the median of the data).
         filter_torque: whether to filter tau as well (default: only if samples are dropped).
         decimate: keep every `decimate`-th sample.
         trim: time cut off at both ends of every part, s (default: 1.5 periods of the cut-off).
@@ -113,10 +111,7 @@ def smooth(
     clock = source_clock(data, of_q)
     if clock is not None:
         data = data._replace(t=clock.t, q=interpolate(clock.t, data.q, data.trajectory, of_q))
-    if rate is None:
-        # Rounding removes the rounding errors of time differences.
-        rate = float(f"{sampling.timing(data.t, data.trajectory).rate:.9g}")
-    require_positive(rate=rate)
+    rate = sampling.typical_rate(data)
     d, values = data.degrees_of_freedom, np.hstack([data.q, data.tau])
     pieces = segments(data.t, data.trajectory, gap=max(sampling.BRIDGED, SHORT * rate))
     even = [sampling.even(data.t[piece], values[piece], rate) for piece in pieces]
