@@ -176,13 +176,13 @@ def _factor(title: str, key: str, unit: str | None, stated: str | None) -> float
     known = UNITS[key]
     if not known:
         return 1.0
-    if unit is None and stated is None:
-        example = EXAMPLES.get(key, "q1 [rad] or q1 [deg]")
-        raise InputError(
-            f"'{title:.60}' has no unit; write it into the header, as in '{example}', or give --units si "
-            "(or degrees) for all titles without one"
-        )
     if unit is None:
+        if stated is None:
+            example = EXAMPLES.get(key, "q1 [rad] or q1 [deg]")
+            raise InputError(
+                f"'{title:.60}' has no unit; write it into the header, as in '{example}', or give --units si "
+                "(or degrees) for all titles without one"
+            )
         return known[STATED[stated][key]] if key in STATED[stated] else 1.0
     if unit not in known:
         raise InputError(f"the unit of '{title:.60}' is not known; expected one of {', '.join(known)}")

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.data.robot_xml import MOVING, parsed
-from dln_jax.data.robots import Robot, joint_names, opened
+from dln_jax.data.robot_xml import MOVING, parse_robot
+from dln_jax.data.robots import Robot, compile_robot, joint_names
 from dln_jax.files import write_bytes
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.inertia import moved, parts, pseudo_inertia
@@ -106,8 +106,8 @@ def write_robot(
     path, original = Path(path), Path(original)
     if path.exists() and original.exists() and path.samefile(original):
         raise InputError(f"{path} is the original file, which stays unchanged; give another name")
-    root = parsed(original)
-    _, model, locked = opened(original, copy.deepcopy(root), lock)
+    root = parse_robot(original)
+    _, model, locked = compile_robot(original, copy.deepcopy(root), lock)
     names = [name for name in joint_names(model) if name not in locked]
     if list(tree.names) != names:
         raise InputError(f"{original} has the joints {', '.join(names)}; the tree has {', '.join(tree.names)}")

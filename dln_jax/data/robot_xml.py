@@ -60,7 +60,7 @@ class _Elements(ET.TreeBuilder):
         return super().end(tag.rpartition("}")[2])
 
 
-def parsed(path: Path) -> ET.Element:
+def parse_robot(path: Path) -> ET.Element:
     """The root element of a URDF or MJCF file, comments included; errors as for `read_robot`."""
     root = _root(path)
     if root.tag not in ("robot", "mujoco"):

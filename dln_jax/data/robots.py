@@ -18,7 +18,7 @@ from dln_jax.data.robot_xml import (
     MOST_JOINTS,
     check_joints,
     link_inertias,
-    parsed,
+    parse_robot,
     require_range,
     velocity_limits,
     without_shapes,
@@ -62,11 +62,11 @@ def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = 
             revolute, continuous nor prismatic, mimics another, has a spring, or has limits that are NaN, equal,
             swapped or half stated; a joint to lock does not exist; no joint moves; or a moving link has no mass.
     """
-    path, root = Path(path), parsed(Path(path))
+    path, root = Path(path), parse_robot(Path(path))
     try:
         in_urdf = root.tag == "robot"
         inertias, speeds = (link_inertias(root), velocity_limits(root)) if in_urdf else (None, {})
-        mujoco, model, locked = opened(path, root, lock)
+        mujoco, model, locked = compile_robot(path, root, lock)
         robot = robot_of(mujoco, model, locked, inertias)
         limits = np.array([speeds.get(name, np.inf) for name in robot.tree.names])
         return robot._replace(velocity_limits=limits) if in_urdf else robot
@@ -74,7 +74,7 @@ def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = 
         raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
 
 
-def opened(
+def compile_robot(
     path: Path, root: ET.Element, lock: Mapping[str, float] | Sequence[str], *, inertias: bool = False
 ) -> tuple[Any, Any, dict[str, float]]:
     """MuJoCo, its model of the file with this root element, and the positions of locked joints by name.

@@ -163,7 +163,7 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
     if needs is not None and needs.degrees_of_freedom != d:
         raise InputError(f"needs states {needs.degrees_of_freedom} joints, but q has {d} columns; make them agree")
     turning = ["revolute"] * d if needs is None else needs.joints
-    q, wraps = _unwrapped(q, trajectory, np.array(turning) == "revolute")
+    q, wraps = _unwrap(q, trajectory, np.array(turning) == "revolute")
     temperature = arrays.get("temperature")
     if temperature is not None:
         temperature = np.asarray(temperature)
@@ -233,7 +233,7 @@ def _named_trajectories(arrays: dict[str, Any], t: np.ndarray) -> tuple[np.ndarr
     return trajectory, label
 
 
-def _unwrapped(q: np.ndarray, trajectory: np.ndarray, revolute: np.ndarray) -> tuple[np.ndarray, list[str]]:
+def _unwrap(q: np.ndarray, trajectory: np.ndarray, revolute: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """Angles without the jumps by 2 pi of sensors that wrap, and remarks on them.
 
     A joint is left alone if a step beside its jumps, or more than one in a hundred, is long: turns could be motions.

@@ -18,7 +18,7 @@ from dln_jax.data.checks.channels import (
 )  # fmt: skip
 from dln_jax.data.checks.priors import any_energy
 from dln_jax.data.checks.torques import Torques, check_degrees, check_torques, examine_torques
-from dln_jax.data.checks.tree import OnTree, against_tree
+from dln_jax.data.checks.tree import OnTree, compare_with_tree
 from dln_jax.data.encoders.sampling import Repeats, step_of, timing, without_repeats
 from dln_jax.data.encoders.smoothing import Smoothed, smooth
 from dln_jax.data.repeated_motions import motion_numbers
@@ -138,7 +138,7 @@ def examine(data: Trajectories, robot: Robot | None = None, *, repaired: Sequenc
     if robot is not None:
         samples = distinct if even is None else even.data
         names = () if data.joint_names is None else tuple(map(str, data.joint_names))
-        on_tree = against_tree(samples, robot, names, driven=driven, farthest=farthest, equations=equations)
+        on_tree = compare_with_tree(samples, robot, names, driven=driven, farthest=farthest, equations=equations)
         findings += on_tree.findings
         torques = on_tree.torques
     findings.sort(key=lambda finding: SEVERITIES.index(finding.severity))

@@ -67,7 +67,7 @@ class OnTree(NamedTuple):
     """Examination with a prior near the tree's parameters; `None` without torques or with too few samples."""
 
 
-def against_tree(
+def compare_with_tree(
     data: Trajectories, robot: Robot, names: tuple[str, ...], *, driven: bool, farthest: int, equations: int
 ) -> OnTree:
     """Compares samples with sound rates with a robot's tree.

@@ -202,7 +202,7 @@ def _step(channel: np.ndarray) -> float:
     return smallest if np.mean(np.abs(multiples - np.round(multiples)) < 0.05) > 0.99 else 0.0
 
 
-def delayed(values: Float[np.ndarray, "N k"], samples: float) -> Float[np.ndarray, "N k"]:
+def delay_held(values: Float[np.ndarray, "N k"], samples: float) -> Float[np.ndarray, "N k"]:
     """Delays held values by a number of samples, and returns their mean over the step that follows each sample.
 
     Values before the first sample are zero.
