@@ -76,6 +76,11 @@ class Log(NamedTuple):
         return self.data.tau[self.rows + shift][:, list(self.order)] * self.signs
 
 
+Inertias = tuple[np.ndarray, list[np.ndarray], list[np.ndarray], int]
+"""Mean of inertial torques [d], their covariances with the torques [d, n d] and with themselves [d, d], and the first of
+the weights that these are for."""
+
+
 class Prior(NamedTuple):
     """Gaussian prior of the torques of n samples [n d], sample by sample."""
 
@@ -84,9 +89,8 @@ class Prior(NamedTuple):
     """Covariances, to be weighted."""
     columns: list[Float[np.ndarray, "a k"]]
     """Factors C of further covariances C Cᵀ, to be weighted; the last d are friction, joint by joint."""
-    inertias: Callable[..., tuple[np.ndarray, list[np.ndarray], list[np.ndarray], int]]
-    """(states q, qd and qdd [m, d], R [d, m d]) -> R times the inertial torques at these states: mean [d], and lists of
-    covariances with the torques [d, n d] and with themselves [d, d], for the weights from a place on."""
+    inertias: Callable[[Sequence[np.ndarray], np.ndarray], Inertias]
+    """(states q, qd and qdd [m, d], R [d, m d]) -> R times the inertial torques at these states."""
 
 
 Build = Callable[[Log], Prior]
@@ -184,9 +188,7 @@ def any_energy(joints: Sequence[str]) -> Build:
         states = log.states()
         sizes = sizes_of(log)
 
-        def inertias(
-            pushed: Sequence[np.ndarray], rows: np.ndarray
-        ) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray], int]:
+        def inertias(pushed: Sequence[np.ndarray], rows: np.ndarray) -> Inertias:
             shared = [rows @ kinetic for kinetic, _ in covariances(pushed, states, joints, sizes)]
             own = [rows @ kinetic @ rows.T for kinetic, _ in covariances(pushed, pushed, joints, sizes)]
             return np.zeros(len(rows)), shared, own, 0

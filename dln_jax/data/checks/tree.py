@@ -9,7 +9,7 @@ import numpy as np
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.checks.channels import Finding, away_from_ends, on_joints
-from dln_jax.data.checks.priors import Build, Log, Prior, friction, gyroscopic, sizes_of
+from dln_jax.data.checks.priors import Build, Inertias, Log, Prior, friction, gyroscopic, sizes_of
 from dln_jax.data.checks.torques import Torques, check_torques, examine_torques
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
@@ -208,9 +208,7 @@ def near_tree(
         def weighted(columns: np.ndarray) -> list[np.ndarray]:
             return [columns[:, : 10 * d] * sizes, columns[:, 10 * d :] * scales]
 
-        def inertias(
-            pushed: Sequence[np.ndarray], rows: np.ndarray
-        ) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray], int]:
+        def inertias(pushed: Sequence[np.ndarray], rows: np.ndarray) -> Inertias:
             columns = rows @ phi(*pushed, np.zeros(3)).reshape(rows.shape[1], -1)
             parts = weighted(columns)
             shared = [part @ of_log.T for part, of_log in zip(parts, own, strict=True)]

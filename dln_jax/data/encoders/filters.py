@@ -131,8 +131,8 @@ def low_pass(
     return np.concatenate(filtered)
 
 
-def _between_ends(values: Float[np.ndarray, "n k"], near: int) -> Float[np.ndarray, "n k"]:
-    """The quintic with the values' own value, slope and curvature at both ends, estimated from `near` samples.
+def _between_ends(values: np.ndarray, near: int) -> np.ndarray:
+    """The quintic with the own value, slope and curvature of values [n, k] at both ends, estimated from `near` samples.
 
     Without it the values are straight at their ends, where the filter extends them by reflection; it is slow enough to
     pass every filter. Zero for fewer samples than twice `near`.
@@ -204,10 +204,8 @@ def choose_cutoff(
     return Choice(cutoff, tried, error, f, spectrum, white)
 
 
-def _without_jumps(
-    values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"], noise: Float[np.ndarray, " k"]
-) -> Float[np.ndarray, "N k"]:
-    """Interpolates rare samples that neither noise nor the motion explains.
+def _without_jumps(values: np.ndarray, trajectory: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Interpolates rare samples of channels [N, k] that neither noise [k] nor the motion explains.
 
     A sample is compared with the prediction of the quintic through three samples on either side, (1, -6, 15, 15, -6, 1)
     / 20. It is a jump if the error is many standard deviations both of the noise and of such errors elsewhere.
@@ -231,8 +229,8 @@ def _without_jumps(
     return values
 
 
-def _flat_top(f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"]) -> Float[np.ndarray, " d"]:
-    """Level of the upper half of a spectrum that is flat, as white noise is; zero otherwise."""
+def _flat_top(f: np.ndarray, spectrum: np.ndarray) -> np.ndarray:
+    """Level [d] of the upper half of a spectrum [F, d] that is flat, as white noise is; zero otherwise."""
     parts = [np.median(part, axis=0) for part in np.array_split(spectrum[f > f[-1] / 2], 3) if len(part)]
     if len(parts) < 3:
         return np.zeros(spectrum.shape[1])
@@ -241,10 +239,8 @@ def _flat_top(f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"]) ->
     return np.where(flat, levels.min(axis=0) / MEDIAN, 0.0)
 
 
-def _rising(
-    f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"], white: Float[np.ndarray, " d"]
-) -> Float[np.ndarray, "F d"]:
-    """The part of a spectrum above the minimum of the acceleration power, if that rises up to half the rate; else zero.
+def _rising(f: np.ndarray, spectrum: np.ndarray, white: np.ndarray) -> np.ndarray:
+    """Part of a spectrum [F, d] above the minimum of the acceleration power, if that rises up to half the rate; else 0.
 
     Forces of finite power make accelerations with a falling spectrum, so a rising one is noise, white or not: timing
     jitter of a fraction of a step, for example, is noise proportional to the velocity. Zero, too, if the minimum is
@@ -268,10 +264,8 @@ def _rising(
     return rising
 
 
-def _spectra(
-    values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"], *, rate: float
-) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F k"]]:
-    """Positive frequencies, Hz, and power spectra of the channels, unit² / Hz, averaged over segments.
+def _spectra(values: np.ndarray, trajectory: np.ndarray, *, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Positive frequencies [F], Hz, and power spectra [F, k] of channels [N, k], unit² / Hz, averaged over segments.
 
     Raises:
         InputError: no trajectory has sixteen samples.
@@ -294,8 +288,8 @@ def _spectra(
     return f[1:], power / (2 * np.sin(np.pi * f[1:, None] / rate)) ** 4
 
 
-def _mean(spectrum: Float[np.ndarray, "F d"]) -> Float[np.ndarray, "F d"]:
-    """Mean over a sixth of an octave on either side, which keeps lines."""
+def _mean(spectrum: np.ndarray) -> np.ndarray:
+    """Mean of a spectrum [F, d] over a sixth of an octave on either side, which keeps lines."""
     summed = np.concatenate([np.zeros((1, spectrum.shape[1])), np.cumsum(spectrum, axis=0)])
     low, high = _window(len(spectrum), 2 ** (-1 / 6), 2 ** (1 / 6))
     return (summed[high] - summed[low]) / (high - low)[:, None]
