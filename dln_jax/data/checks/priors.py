@@ -77,8 +77,8 @@ class Log(NamedTuple):
 
 
 Inertias = tuple[np.ndarray, list[np.ndarray], list[np.ndarray], int]
-"""Mean of inertial torques [d], their covariances with the torques [d, n d] and with themselves [d, d], and the place of
-the first weight of these."""
+"""Mean of inertial torques [d], their covariances with the torques [d, n d] and with themselves [d, d], and the place
+of the first weight of these."""
 
 
 class Prior(NamedTuple):
