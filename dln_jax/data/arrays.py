@@ -10,7 +10,6 @@ import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, TypeVar
 
 import jax.numpy as jnp
@@ -23,15 +22,13 @@ from dln_jax.sizes import LARGEST, SMALLEST
 from dln_jax.types import InputError
 
 Data = TypeVar("Data")
-Reader = Callable[[Path], tuple[dict[str, Any], list[str]]]
-"""Reader of a file of another format: arrays by key, and the names of what it does not read."""
+Reader = Callable[[Path], dict[str, Any]]
+"""Reader of a file or folder: arrays by key, and under `UNREAD` the names of what it does not read."""
 
 MOST_BYTES = 4 * 2**30
 """Limit on all arrays of one file, since a small archive may expand a thousandfold."""
 UNREAD = "unread"
 """Key of the names, such as titles of columns, that a reader leaves out."""
-FOLDER = "/"
-"""Key of the reader of folders."""
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 """Header readers for the versions of NumPy's format that hold numbers and strings."""
 MOST_TIMES_TYPICAL = 1e20
@@ -44,7 +41,7 @@ def load_file(
     from_arrays: Callable[[dict[str, Any]], Data],
     keys: Sequence[str],
     *,
-    readers: Mapping[str, Reader] = MappingProxyType({}),
+    reader: Reader | None = None,
 ) -> Data:
     """Reads the arrays with these keys, if present, and passes them to `from_arrays`, which checks them.
 
@@ -52,24 +49,21 @@ def load_file(
 
     Args:
         from_arrays: converts arrays by key into the result.
-        readers: readers of other formats, by the ending of the name such as ".csv"; that of folders is `FOLDER`.
+        reader: reads a file of another format or a folder; by default npz.
 
     Raises:
         InputError: the file is missing, is not an npz, is damaged, holds pickled objects or more than `MOST_BYTES`, or
-            `from_arrays` or a reader rejects its contents (the message then starts with the path).
+            `from_arrays` or the reader rejects its contents (the message then starts with the path).
     """
     path = Path(path)
-    folder = FOLDER in readers and is_folder(path)
-    if not is_file(path) and not folder:
-        kinds = "an npz or CSV file, or a ROS bag" if readers else "an npz file"
-        raise InputError(f"{path!s:.200}: no such file; give the path of {kinds}")
-    unread: list[str] = []
+    if not is_file(path) and not (reader is not None and is_folder(path)):
+        raise InputError(f"{path!s:.200}: no such file; give the path of the data")
+    arrays = {}
     try:
-        reader = readers.get(FOLDER if folder else path.suffix.lower())
-        arrays, unread = _read(path, keys) if reader is None else reader(path)
-        return from_arrays(arrays | ({UNREAD: unread} if unread else {}))
+        arrays = _read(path, keys) if reader is None else reader(path)
+        return from_arrays(arrays)
     except InputError as error:
-        names = "".join(f" ({line})" for line in unread_line({UNREAD: unread}))
+        names = "".join(f" ({line})" for line in unread_line(arrays))
         raise InputError(f"{path}: {error}{names}") from None
 
 
@@ -79,9 +73,10 @@ def unread_line(arrays: Mapping[str, Any]) -> tuple[str, ...]:
     return (f"not read: {names if len(names) <= 200 else f'{names[:200]}...'}",) if names else ()
 
 
-def _read(path: Path, keys: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
-    """The arrays with these keys, and the names of all others."""
-    arrays, room, key = {}, MOST_BYTES, None
+def _read(path: Path, keys: Sequence[str]) -> dict[str, Any]:
+    """The arrays of an npz file with these keys, and the names of all others."""
+    arrays: dict[str, Any] = {}
+    room, key = MOST_BYTES, None
     try:
         with zipfile.ZipFile(path) as archive:
             names = [name.removesuffix(".npy") for name in archive.namelist()]
@@ -98,7 +93,7 @@ def _read(path: Path, keys: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
             f"not a readable npz file without pickled objects ({type(error).__name__}{where}); "
             "write it with numpy.savez and plain numeric or string arrays"
         ) from error
-    return arrays, [name for name in names if name not in keys]
+    return {**arrays, UNREAD: [name for name in names if name not in keys]}
 
 
 def _array(file: Any, size: int, room: int) -> np.ndarray:

@@ -9,9 +9,9 @@ series are put on one clock by these rules:
 - A time is left out unless every series has two messages around it at most `BRIDGED` of its median steps apart.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -30,59 +30,43 @@ RESTART = 1_000_000_000
 """Largest backward jump of stamps in ns (messages out of order); after a longer one, stamps are not used."""
 INSTALL = "pip install 'dln-jax[bag]'"
 
-Choose = Callable[[Sequence[str]], Sequence[str]]
-"""Names in a log -> the joints to keep, in their order."""
+Series = tuple[np.ndarray, np.ndarray, str]
+"""One quantity of one joint: increasing stamps in ns, values, and the topic."""
 
 
-class Series(NamedTuple):
-    """One quantity of one joint."""
-
-    stamps: np.ndarray
-    """ns, increasing."""
-    values: np.ndarray
-    topic: str
-
-
-class Messages(NamedTuple):
-    """Series of one topic, and remarks about its stamps."""
-
-    series: dict[tuple[str, str], Series]
-    """Series by field and joint."""
-    remarks: tuple[str, ...]
-
-
-def read(path: Path, *, topics: Sequence[str] = (), choose: Choose = tuple) -> tuple[dict[str, Any], list[str]]:
-    """Reads a bag, or every bag in a folder as a trajectory: arrays by schema key, and no unread keys.
+def read(path: Path, *, topics: Sequence[str], select: Callable[[Sequence[str]], Mapping[str, str]]) -> dict[str, Any]:
+    """Reads a bag, or every bag in a folder as a trajectory: arrays by schema key.
 
     Args:
         path: .db3, .mcap or .bag file, folder of a ROS 2 bag, or folder of bags.
-        topics: topics to read; if quantities repeat, the first topic counts. Default: the only topic of joint states.
+        topics: topics to read; if quantities repeat, the first counts. Without any, the only topic of joint states.
+        select: names in the log -> the joints to keep, in their order, with their new names.
 
     Raises:
         InputError: no rosbags, no bag, an absent or ambiguous topic, malformed messages, or no overlap in time.
     """
-    bags = paths(path)
-    parts = []
+    bags = _paths(path)
+    parts, remarks = [], []
     for bag in bags:
         try:
-            parts.append(one(bag, topics, choose))
+            arrays, of_bag = _read_one(bag, topics, select)
         except InputError as error:
             raise InputError(str(error) if bag == path else f"{bag.name}: {error}") from None
+        parts.append(arrays)
+        remarks += [f"{bag.name}: {remark}" for remark in of_bag]
     first = parts[0]
     for bag, part in zip(bags, parts, strict=True):
-        if (missing := {*first} ^ {*part}) or list(part["joint_names"]) != list(first["joint_names"]):
+        if (missing := {*first} ^ {*part}) or part["joint_names"].tolist() != first["joint_names"].tolist():
             what = f"{', '.join(sorted(missing))} only in one" if missing else "other joints"
             raise InputError(f"{bags[0].name} and {bag.name} differ ({what}); give bags of the same joints and fields")
-    arrays = {key: np.concatenate([part[key] for part in parts]) for key in ("t", *FIELDS.values()) if key in first}
-    arrays |= {"trajectory": np.repeat(np.arange(len(parts)), [len(part["t"]) for part in parts])}
-    arrays |= {"label": np.array([bag.stem for bag in bags]), "joint_names": np.array(first["joint_names"])}
-    remarks = [
-        f"{bag.name}: {remark}" for bag, part in zip(bags, parts, strict=True) for remark in part["remarks"]
-    ]  # fmt: skip
-    return {**arrays, "remarks": tuple(remarks)}, []
+    arrays = {key: np.concatenate([part[key] for part in parts]) for key in first if key != "joint_names"}
+    trajectory = np.repeat(np.arange(len(parts)), [len(part["t"]) for part in parts])
+    label = np.array([bag.stem for bag in bags])
+    more = {"trajectory": trajectory, "label": label, "joint_names": first["joint_names"]}
+    return {**arrays, **more, "remarks": tuple(remarks)}
 
 
-def paths(path: Path) -> list[Path]:
+def _paths(path: Path) -> list[Path]:
     """The bags that a path names."""
     if not path.is_dir() or (path / METADATA).is_file():
         return [path]
@@ -96,21 +80,25 @@ def paths(path: Path) -> list[Path]:
     return inside
 
 
-def one(path: Path, topics: Sequence[str], choose: Choose) -> dict[str, Any]:
-    """Arrays of one bag, with its `remarks`."""
-    by_topic = {topic: _series(topic, rows) for topic, rows in _messages(path, topics).items()}
+def _read_one(
+    path: Path, topics: Sequence[str], select: Callable[[Sequence[str]], Mapping[str, str]]
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Arrays of one bag, and remarks."""
     series: dict[tuple[str, str], Series] = {}
-    for messages in by_topic.values():
-        series = {**messages.series, **series}
+    remarks: list[str] = []
+    messages = _messages(path, topics)
+    for topic, rows in messages.items():
+        of_topic, of_stamps = _series(topic, rows)
+        series = {**of_topic, **series}
+        remarks += of_stamps
     positioned = list(dict.fromkeys(joint for field, joint in series if field == "position"))
     if not positioned:
-        raise InputError(f"no message of {', '.join(by_topic)} has names and positions; choose others: --topics")
-    joints = list(choose(positioned))
+        raise InputError(f"no message of {', '.join(messages)} has names and positions; choose others: --topics")
+    joints = select(positioned)
     there = {field: [joint for joint in joints if (field, joint) in series] for field in FIELDS}
-    remarks = [remark for messages in by_topic.values() for remark in messages.remarks]
     if left_out := [joint for joint in positioned if joint not in joints]:
         remarks.append(f"joints left out: {', '.join(left_out)}")
-    if any(series["effort", joint].values.any() for joint in there["effort"]):
+    if any(series["effort", joint][1].any() for joint in there["effort"]):
         if without := [joint for joint in joints if joint not in there["effort"]]:
             raise InputError(
                 f"joint '{without[0]}' has no efforts, others have; read these alone: --joints "
@@ -121,68 +109,66 @@ def one(path: Path, topics: Sequence[str], choose: Choose) -> dict[str, Any]:
         there["effort"] = []
     if 0 < len(there["velocity"]) < len(joints):
         remarks.append("velocities of some joints are missing; they are derived from q for all")
-    kept = {field: joints for field, names in there.items() if len(names) == len(joints)}
-    times, values, clock = on_one_clock({(f, joint): series[f, joint] for f in kept for joint in joints})
-    arrays: dict[str, Any] = {"t": 1e-9 * (times - times[0])}
-    for field in kept:
+    complete = [field for field, names in there.items() if len(names) == len(joints)]
+    times, values, clock = _on_one_clock(
+        {(field, joint): series[field, joint] for field in complete for joint in joints}
+    )
+    arrays = {"t": 1e-9 * (times - times[0])}
+    for field in complete:
         arrays[FIELDS[field]] = np.stack([values[field, joint] for joint in joints], axis=1)
-    return {**arrays, "joint_names": joints, "remarks": (*remarks, *clock)}
+    return {**arrays, "joint_names": np.array(list(joints.values()))}, [*remarks, *clock]
 
 
-def on_one_clock(
+def _on_one_clock(
     series: dict[tuple[str, str], Series],
-) -> tuple[np.ndarray, dict[tuple[str, str], np.ndarray], tuple[str, ...]]:
+) -> tuple[np.ndarray, dict[tuple[str, str], np.ndarray], list[str]]:
     """Stamps of the slowest series, values of all series there, and remarks, by the rules of the module.
 
     Raises:
         InputError: the series do not overlap in time.
     """
-    steps = {key: np.median(np.diff(one.stamps)) if len(one.stamps) > 1 else np.inf for key, one in series.items()}
+    steps = {key: np.median(np.diff(own)) if len(own) > 1 else np.inf for key, (own, _, _) in series.items()}
     # Steps that agree to 1 % count as one rate; take the series of that rate with the fewest messages.
     slowest = max(steps.values())
-    key = min((key for key in series if steps[key] >= 0.99 * slowest), key=lambda key: len(series[key].stamps))
-    clock = series[key].stamps
+    key = min((key for key in series if steps[key] >= 0.99 * slowest), key=lambda key: len(series[key][0]))
+    clock, _, topic = series[key]
     inside = np.ones(len(clock), bool)
-    for other, own in series.items():
-        after = np.searchsorted(own.stamps, clock)
-        at = np.minimum(after, len(own.stamps) - 1)
-        around = (after > 0) & (after < len(own.stamps))
-        near = own.stamps[at] - own.stamps[np.maximum(at - 1, 0)] <= BRIDGED * steps[other]
-        inside &= (own.stamps[at] == clock) | (around & near)
+    for other, (stamps, _, _) in series.items():
+        after = np.searchsorted(stamps, clock)
+        at = np.minimum(after, len(stamps) - 1)
+        around = (after > 0) & (after < len(stamps))
+        near = stamps[at] - stamps[np.maximum(at - 1, 0)] <= BRIDGED * steps[other]
+        inside &= (stamps[at] == clock) | (around & near)
     times = clock[inside]
     if len(times) < 2:
-        topics = ", ".join(sorted({own.topic for own in series.values()}))
+        topics = ", ".join(sorted({own for _, _, own in series.values()}))
         raise InputError(
             f"the messages of {topics} do not overlap in time ({len(times)} common samples); leave joints out by "
             f"--joints, or choose other --topics"
         )
-    exact = all(np.isin(times, own.stamps, assume_unique=True).all() for own in series.values())
-    values = {other: _at(own, times, cubic=other[0] != "effort") for other, own in series.items()}
+    exact, values = True, {}
+    for (field, joint), (stamps, known, _) in series.items():
+        places = np.minimum(np.searchsorted(stamps, times), len(stamps) - 1)
+        equal = stamps[places] == times
+        values[field, joint] = known[places]
+        if not equal.all():
+            exact = False
+            t, at = 1e-9 * (stamps - stamps[0]), 1e-9 * (times - stamps[0])
+            cubic = field != "effort" and len(t) > 3
+            between = CubicSpline(t, known)(at) if cubic else np.interp(at, t, known)
+            values[field, joint] = np.where(equal, known[places], between)
     if exact and inside.all():
-        return times, values, ()
+        return times, values, []
     rate = f"{1e9 / steps[key]:.4g} Hz" if np.isfinite(steps[key]) else "one message"
     rule = "" if exact else "; q and qd by cubic splines between messages, tau linearly"
     left = f"; {np.sum(~inside)} times without near messages of all joints are left out" * (not inside.all())
-    return times, values, (f"clock: stamps of {key[0]} of {key[1]} in {series[key].topic}, {rate}{rule}{left}",)
+    return times, values, [f"clock: stamps of {key[0]} of {key[1]} in {topic}, {rate}{rule}{left}"]
 
 
-def _at(series: Series, times: np.ndarray, *, cubic: bool) -> np.ndarray:
-    """Values of a series at times inside it; exact at its own stamps."""
-    places = np.minimum(np.searchsorted(series.stamps, times), len(series.stamps) - 1)
-    equal = series.stamps[places] == times
-    if equal.all():
-        return series.values[places]
-    start = series.stamps[0]
-    t, at = 1e-9 * (series.stamps - start), 1e-9 * (times - start)
-    between = CubicSpline(t, series.values)(at) if cubic and len(t) > 3 else np.interp(at, t, series.values)
-    return np.where(equal, series.values[places], between)
-
-
-def _series(topic: str, rows: Iterator[tuple[int, Any]]) -> Messages:
-    """Sorted series of a topic from (time of receipt in ns, message)."""
-    received, stamps, columns = [], [], {}
-    for number, (receipt, message) in enumerate(rows):
-        received.append(receipt)
+def _series(topic: str, rows: Sequence[tuple[int, Any]]) -> tuple[dict[tuple[str, str], Series], list[str]]:
+    """Sorted series of a topic by field and joint, from (time of receipt in ns, message), and remarks on stamps."""
+    stamps, columns = [], {}
+    for number, (_, message) in enumerate(rows):
         stamps.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
         names = list(message.name)
         require_once(f"message {number + 1} of {topic}", names)
@@ -199,23 +185,23 @@ def _series(topic: str, rows: Iterator[tuple[int, Any]]) -> Messages:
     if not times.all() or (np.diff(times) < -RESTART).any():
         why = "some messages have no stamp" if not times.all() else "stamps jump back by more than 1 s"
         remarks.append(f"{topic}: {why}; times of receipt are used")
-        times = np.array(received, np.int64)
-    series, repeated, reversed_ = {}, 0, 0
+        times = np.array([receipt for receipt, _ in rows], np.int64)
+    series, repeated, backward = {}, 0, 0
     for key, column in columns.items():
         numbers, values = (np.array(part) for part in zip(*column, strict=True))
         own = times[numbers.astype(int)]
-        reversed_ = max(reversed_, int(np.sum(np.diff(own) < 0)))
+        backward = max(backward, int(np.sum(np.diff(own) < 0)))
         distinct, first = np.unique(own, return_index=True)
         repeated = max(repeated, len(own) - len(distinct))
-        series[key] = Series(distinct, values[first], topic)
+        series[key] = distinct, values[first], topic
     if repeated:
         remarks.append(f"{topic}: {repeated} messages repeat a stamp (the first is kept)")
-    if reversed_:
-        remarks.append(f"{topic}: {reversed_} messages are earlier than the one before (sorted by stamp)")
-    return Messages(series, tuple(remarks))
+    if backward:
+        remarks.append(f"{topic}: {backward} messages are earlier than the one before (sorted by stamp)")
+    return series, remarks
 
 
-def _messages(path: Path, topics: Sequence[str]) -> dict[str, Iterator[tuple[int, Any]]]:
+def _messages(path: Path, topics: Sequence[str]) -> dict[str, list[tuple[int, Any]]]:
     """Messages with their times of receipt by topic, in the order of `topics`."""
     try:
         from rosbags.highlevel import AnyReader
@@ -238,7 +224,7 @@ def _messages(path: Path, topics: Sequence[str]) -> dict[str, Iterator[tuple[int
         raise InputError(f"not a readable ROS bag ({type(error).__name__}: {reason}); see `ros2 bag info`") from error
     if empty := [topic for topic, own in rows.items() if not own]:
         raise InputError(f"topic {empty[0]} has no messages")
-    return {topic: iter(own) for topic, own in rows.items()}
+    return rows
 
 
 def _wanted(topics: Sequence[str], everywhere: dict[str, str]) -> list[str]:

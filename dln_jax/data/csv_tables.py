@@ -14,11 +14,12 @@ import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from dln_jax.data.arrays import UNREAD
 from dln_jax.files import write_bytes
 from dln_jax.types import InputError, JointKind
 
@@ -26,6 +27,8 @@ MOST_BYTES = 2**30
 """Largest file read; larger data are faster and smaller as npz."""
 STATED = {"si": {}, "degrees": {"q": "deg", "qd": "deg/s", "qdd": "deg/s2"}}
 """Units that a caller may state for titles without one: by key, SI for all others."""
+ALONE = ("t", "trajectory")
+"""Keys of one column, whatever the joints."""
 DECIMALS = 10
 """Significant digits written, and decimals of rounded numbers."""
 TURN = math.pi / 180
@@ -56,20 +59,8 @@ _TITLE = re.compile(rf"({'|'.join(sorted(UNITS, key=len, reverse=True))}|time)(?
 _BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\])]*)[\])]\s*", re.DOTALL)
 
 
-class Column(NamedTuple):
-    """A column to read."""
-
-    title: str
-    key: str
-    """Key of the schema."""
-    joint: str
-    """Number or name of the joint; empty if the title has none."""
-    unit: str | None
-    """Spelled as in `UNITS`; `None` if the title has none."""
-
-
-def read(path: Path, *, units: str | None = None) -> tuple[dict[str, Any], list[str]]:
-    """Reads a CSV file: the arrays by schema key, in SI units, and the titles of other columns.
+def read(path: Path, *, units: str | None = None) -> dict[str, Any]:
+    """Reads a CSV file: the arrays by schema key, in SI units, and the titles of other columns under `UNREAD`.
 
     Args:
         units: units of titles without one: "si", or "degrees" for angles in degrees and all else in SI.
@@ -86,23 +77,28 @@ def read(path: Path, *, units: str | None = None) -> tuple[dict[str, Any], list[
         raise InputError(f"holds {size / 2**30:.1f} GiB; at most 1 GiB is read as CSV: store it as npz, or split it")
     try:
         titles = _header(path)
-        columns = {place: column for place, title in enumerate(titles) if (column := _column(title)) is not None}
-        factors = {place: _factor(column, units) for place, column in columns.items()}
-        places = _by_key(columns)
+        columns = {place: parsed for place, title in enumerate(titles) if (parsed := _key_joint_unit(title))}
+        factors = {place: _factor(titles[place], key, unit, units) for place, (key, _, unit) in columns.items()}
+        places = _by_key(titles, columns)
         table = _numbers(path, titles, set(columns))
     except UnicodeDecodeError:
         raise InputError("not a text file in UTF-8; export the log as CSV again") from None
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})") from None
-    _require_degrees(units, table[:, [place for place in places.get("q", ()) if columns[place].unit is None]])
-    arrays: dict[str, Any] = {
-        key: np.stack([factors[place] * table[:, place] for place in own], axis=1) for key, own in places.items()
-    }
-    arrays |= {key: arrays[key][:, 0] for key in ("t", "trajectory") if key in arrays}
-    joints = [columns[place].joint for place in places.get("q", [])]
+    bare = table[:, [place for place in places.get("q", ()) if columns[place][2] is None]]
+    if units == "degrees" and bare.size and (largest := float(np.abs(bare).max())) <= 2 * math.pi:
+        raise InputError(
+            f"--units degrees: q goes to {largest:.3g} at most, as angles in radians do; give --units si, or write "
+            "[deg] into the titles if these are degrees"
+        )
+    arrays: dict[str, Any] = {UNREAD: [title for place, title in enumerate(titles) if place not in columns]}
+    for key, own in places.items():
+        values = np.stack([factors[place] * table[:, place] for place in own], axis=1)
+        arrays[key] = values[:, 0] if key in ALONE else values
+    joints = [columns[place][1] for place in places.get("q", [])]
     if not all(joint.isdecimal() or not joint for joint in joints):
         arrays["joint_names"] = np.array(joints)
-    return arrays, [title for place, title in enumerate(titles) if place not in columns]
+    return arrays
 
 
 def _header(path: Path) -> list[str]:
@@ -137,17 +133,20 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
             raise InputError(f"line {reader.line_num} is not CSV ({error})") from None
 
 
-def _column(title: str) -> Column | None:
-    """Parses a title; `None` if it names no key of the schema."""
+def _key_joint_unit(title: str) -> tuple[str, str, str | None] | None:
+    """Parses a title; `None` if it names no key of the schema.
+
+    Returns the key, the number or name of the joint, empty if the title has none, and the unit as spelled in `UNITS`.
+    """
     match = _TITLE.fullmatch(title)
     if match is None:
         return None
     key, rest = match[1].replace("time", "t"), match[2]
-    if key in ("t", "trajectory"):
+    if key in ALONE:
         rest = rest.strip(" _")
         inside = _BRACKETS.fullmatch(rest)
         unit = inside[2] if inside and not inside[1] else rest
-        return Column(title, key, "", _spelled(unit) if unit else None)
+        return key, "", _spelled(unit) if unit else None
     unit = None
     while inside := _BRACKETS.fullmatch(rest):
         # q[2] names a joint, q2 [rad] a unit.
@@ -159,7 +158,7 @@ def _column(title: str) -> Column | None:
             words, unit = words[:first], suffix
             break
     joint = "_".join(words)
-    return Column(title, key, str(int(joint)) if joint.isdecimal() else joint, unit)
+    return key, str(int(joint)) if joint.isdecimal() else joint, unit
 
 
 def _spelled(unit: str) -> str:
@@ -172,55 +171,43 @@ def _spelled(unit: str) -> str:
     return unit
 
 
-def _factor(column: Column, stated: str | None) -> float:
-    known = UNITS[column.key]
+def _factor(title: str, key: str, unit: str | None, stated: str | None) -> float:
+    """Conversion factor of a column to SI."""
+    known = UNITS[key]
     if not known:
         return 1.0
-    if column.unit is None:
+    if unit is None:
         if stated is None:
-            example = EXAMPLES.get(column.key, "q1 [rad] or q1 [deg]")
+            example = EXAMPLES.get(key, "q1 [rad] or q1 [deg]")
             raise InputError(
-                f"'{column.title:.60}' has no unit; write it into the header, as in '{example}', or give --units si "
+                f"'{title:.60}' has no unit; write it into the header, as in '{example}', or give --units si "
                 "(or degrees) for all titles without one"
             )
-        return known[STATED[stated][column.key]] if column.key in STATED[stated] else 1.0
-    if column.unit not in known:
-        raise InputError(f"the unit of '{column.title:.60}' is not known; expected one of {', '.join(known)}")
-    return known[column.unit]
+        return known[STATED[stated][key]] if key in STATED[stated] else 1.0
+    if unit not in known:
+        raise InputError(f"the unit of '{title:.60}' is not known; expected one of {', '.join(known)}")
+    return known[unit]
 
 
-def _require_degrees(stated: str | None, q: Float[np.ndarray, "N k"]) -> None:
-    """Refuses positions without a unit that are stated to be in degrees, but do not leave one turn in radians."""
-    if stated == "degrees" and q.size and (largest := float(np.abs(q).max())) <= 2 * math.pi:
-        raise InputError(
-            f"--units degrees: q goes to {largest:.3g} at most, as angles in radians do; give --units si, or write "
-            "[deg] into the titles if these are degrees"
-        )
-
-
-def _by_key(columns: dict[int, Column]) -> dict[str, list[int]]:
+def _by_key(titles: Sequence[str], columns: dict[int, tuple[str, str, str | None]]) -> dict[str, list[int]]:
     """Column indices per key in the joint order of q: by number if all joints are numbers, else as in the file."""
     keys: dict[str, dict[str, int]] = {}
-    for place, column in columns.items():
-        own = keys.setdefault(column.key, {})
-        if column.joint in own:
-            raise InputError(f"'{columns[own[column.joint]].title:.60}' and '{column.title:.60}' are the same column")
-        own[column.joint] = place
+    for place, (key, joint, _) in columns.items():
+        own = keys.setdefault(key, {})
+        if joint in own:
+            raise InputError(f"'{titles[own[joint]]:.60}' and '{titles[place]:.60}' are the same column")
+        own[joint] = place
     joints = list(keys.get("q", {}))
     if all(joint.isdecimal() for joint in joints):
         joints.sort(key=int)
     for key, own in keys.items():
-        if key in ("t", "trajectory") or not joints or (key == "temperature" and list(own) == [""]):
+        if key in ALONE or not joints or (key == "temperature" and list(own) == [""]):
             continue
         for name, there, absent in ((key, own, joints), ("q", joints, own)):
             if missing := [joint for joint in absent if joint not in there]:
                 raise InputError(f"there is no column '{name}{missing[0]:.40}'; q and {key} must name the same joints")
-    return {
-        key: [own[joint] for joint in joints]
-        if key not in ("t", "trajectory") and joints and "" not in own
-        else list(own.values())
-        for key, own in keys.items()
-    }
+        keys[key] = {joint: own[joint] for joint in joints}
+    return {key: list(own.values()) for key, own in keys.items()}
 
 
 def _numbers(path: Path, titles: Sequence[str], read_places: set[int]) -> np.ndarray:

@@ -1,26 +1,24 @@
-"""Joint names of logs: selection, renaming, and their match with the names of a robot.
+"""Joints of logs as a user states them: names, their match with the names of a robot, and factors of torques.
 
 Names that differ from the robot's by one prefix or one ending are matched, such as `panda_joint1` and `fer_joint1`, or
 `elbow` and `elbow_joint`: replacing it must turn every name of the robot into one of the log, in exactly one way.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any
+
+import numpy as np
 
 from dln_jax.types import InputError
 
-
-class Chosen(NamedTuple):
-    """Joints of a log that are kept, in their order."""
-
-    own: tuple[str, ...]
-    """Names in the log."""
-    names: tuple[str, ...]
-    """The same joints, renamed."""
+OPTIONAL = ("qd", "qdd", "tau", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
+PER_JOINT = ("q", *OPTIONAL, "temperature")
+"""Keys of arrays with one column per joint."""
 
 
-def chosen(own: Sequence[str], stated: Sequence[str]) -> Chosen:
-    """Applies the joints that a user stated to the names of a log.
+def select_names(own: Sequence[str], stated: Sequence[str]) -> dict[str, str]:
+    """New names of the joints of a log that a user states, by their names in the log and in the stated order.
 
     Args:
         own: names in the log.
@@ -36,15 +34,36 @@ def chosen(own: Sequence[str], stated: Sequence[str]) -> Chosen:
             raise InputError(f"--joints: '{old:.60}' is not among the log's joints ({_listed(own)})")
         if not new:
             raise InputError(f"--joints: '{old:.60}=' lacks a name; expected LOG=NEW")
-    selects = any("=" not in entry for entry in stated)
-    kept = tuple(renamed) if selects else tuple(own)
-    names = tuple(renamed.get(name, name) for name in kept)
+    kept = own if all("=" in entry for entry in stated) else renamed
+    selected = {name: renamed.get(name, name) for name in kept}
+    names = list(selected.values())
     if len(set(names)) < len(names) or len(renamed) < len(stated):
         raise InputError(f"--joints names a joint twice: {_listed(names)}")
-    return Chosen(kept, names)
+    return selected
 
 
-def matched(own: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
+def with_selected_joints(arrays: dict[str, Any], joints: Sequence[str]) -> dict[str, Any]:
+    """Selects, orders and renames the joints of a file's arrays as stated (see `select_names`).
+
+    Raises:
+        InputError: joints are stated, but the file names none, or `select_names` refuses them.
+    """
+    if not joints:
+        return arrays
+    names = np.asarray(arrays.get("joint_names", ()))
+    if names.ndim != 1 or not names.size or names.dtype.kind not in "US":
+        raise InputError("--joints needs the joints' names, which the file lacks; add joint_names, or names in titles")
+    own = names.tolist()
+    selected = select_names(own, joints)
+    places = [own.index(name) for name in selected]
+    if "needs" in arrays and places != list(range(len(own))):
+        raise InputError("--joints selects or reorders joints, but the file has needs for its own; leave --joints out")
+    present = {key: np.asarray(arrays[key]) for key in PER_JOINT if np.ndim(arrays.get(key)) == 2}
+    columns = {key: array[:, places] for key, array in present.items() if array.shape[1] == len(own)}
+    return {**arrays, **columns, "joint_names": np.array(list(selected.values()))}
+
+
+def match_names(own: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
     """The name in the log of every joint of a robot: the same, or the same but for one prefix or ending.
 
     Args:
@@ -56,10 +75,11 @@ def matched(own: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
     """
     if set(wanted) <= set(own):
         return {name: name for name in wanted}
-    options = [*_by_prefix(own, wanted), *({a[::-1]: b[::-1] for a, b in option.items()} for option in _by_prefix(
-        [name[::-1] for name in own], [name[::-1] for name in wanted]
-    ))]  # fmt: skip
-    options = [option for place, option in enumerate(options) if option not in options[:place]]
+    options = _by_prefix(own, wanted)
+    for option in _by_prefix([name[::-1] for name in own], [name[::-1] for name in wanted]):
+        by_ending = {a[::-1]: b[::-1] for a, b in option.items()}
+        if by_ending not in options:
+            options.append(by_ending)
     if len(options) == 1:
         return options[0]
     remedy = "state them: --joints LOG=ROBOT,LOG=ROBOT"
@@ -71,47 +91,50 @@ def matched(own: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
 
 
 def _by_prefix(own: Sequence[str], wanted: Sequence[str]) -> list[dict[str, str]]:
-    """Matches by the replacement of one prefix, which leaves at least one character of every name."""
+    """Different matches by the replacement of one prefix, which leaves at least one character of every name."""
     known = {name.casefold(): name for name in own}
     options = []
     for name in own:
-        common = _common_ending(name.casefold(), wanted[0].casefold())
+        letters = zip(reversed(name.casefold()), reversed(wanted[0].casefold()), strict=False)
+        common = len(list(itertools.takewhile(lambda pair: pair[0] == pair[1], letters)))
         there, here = len(name) - common, len(wanted[0]) - common
         prefix, replaced = name[:there].casefold(), wanted[0][:here].casefold()
         if not common or not all(other.casefold().startswith(replaced) and len(other) > here for other in wanted):
             continue
         option = {other: known.get(prefix + other[here:].casefold(), "") for other in wanted}
-        if all(option.values()):
+        if all(option.values()) and option not in options:
             options.append(option)
     return options
 
 
-def _common_ending(first: str, second: str) -> int:
-    count = 0
-    while count < min(len(first), len(second)) and first[-1 - count] == second[-1 - count]:
-        count += 1
-    return count
-
-
-def factors(
-    stated: float | int | Sequence[float | int] | Mapping[str, float | int], names: Sequence[str]
-) -> list[float]:
-    """Factor of every joint's torque, from one number, one per joint, or numbers by name (1 for other joints).
+def scale_torques(
+    arrays: dict[str, Any], stated: float | int | Sequence[float | int] | Mapping[str, float | int] | None
+) -> dict[str, Any]:
+    """Multiplies tau by one factor, one per joint, or factors by name (1 for other joints).
 
     Raises:
-        InputError: another number of factors than joints, an unknown name, or a factor of zero.
+        InputError: there is no tau, another number of factors than joints, an unknown name, or a factor of zero.
     """
+    if stated is None:
+        return arrays
+    if np.ndim(arrays.get("tau")) != 2:
+        why = "".join(f"; {remark}" for remark in arrays.get("remarks", ()))
+        raise InputError(f"--torque-factor scales tau, which the file lacks; leave it out{why}")
+    count = np.shape(arrays["tau"])[1]
+    names = np.asarray(arrays.get("joint_names", [str(joint + 1) for joint in range(count)])).astype(str).tolist()
     if isinstance(stated, Mapping):
         if unknown := [name for name in stated if name not in names]:
             raise InputError(f"--torque-factor: '{unknown[0]:.60}' is not among the log's joints ({_listed(names)})")
-        numbers = [float(stated.get(name, 1.0)) for name in names]
+        factors = [float(stated.get(name, 1.0)) for name in names]
     else:
-        numbers = [float(stated)] * len(names) if isinstance(stated, float | int) else [float(n) for n in stated]
-    if len(numbers) != len(names):
-        raise InputError(f"--torque-factor has {len(numbers)} numbers, the log {len(names)} joints; give one, or all")
-    if not all(numbers):
+        factors = [float(stated)] * count if isinstance(stated, float | int) else [float(number) for number in stated]
+    if len(factors) != count:
+        raise InputError(f"--torque-factor has {len(factors)} numbers, the log {count} joints; give one, or all")
+    if not all(factors):
         raise InputError("--torque-factor is zero; expected N m per unit of the log's efforts, negative to turn a sign")
-    return numbers
+    listed = ", ".join(f"{name} {factor:.4g}" for name, factor in zip(names, factors, strict=True))
+    remarks = (*arrays.get("remarks", ()), f"tau is that of the log times {listed}")
+    return {**arrays, "tau": np.asarray(arrays["tau"]) * factors, "remarks": remarks}
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.data import schema
-from dln_jax.data.checks.findings import Finding
-from dln_jax.data.checks.validation import quick
-from dln_jax.data.encoders.clock import clock_line
+from dln_jax.data.checks.channels import Finding
+from dln_jax.data.checks.report import quick
 from dln_jax.data.encoders.smoothing import Smoothed, smooth
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
@@ -230,7 +229,7 @@ def preparation(data: Trajectories, smoothed: Smoothed | None) -> list[str]:
     if count := int((smoothed.repeats.q | smoothed.repeats.tau).sum()):
         lines.append(f"{count} samples repeat the one before and are resampled over")
     if smoothed.clock is not None:
-        lines.append(f"{clock_line(smoothed.clock)}; their times replace t")
+        lines.append(f"{smoothed.clock.line}; their times replace t")
     if smoothed.left_out:
         lines.append(f"{smoothed.left_out} segments are too short for the filter and left out")
     return lines

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.data.robot_xml import MOVING, parsed
-from dln_jax.data.robots import Robot, joint_names, opened
+from dln_jax.data.robot_xml import MOVING, parse_robot
+from dln_jax.data.robots import Robot, compile_robot, joint_names
 from dln_jax.files import write_bytes
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.inertia import moved, parts, pseudo_inertia
@@ -21,6 +21,8 @@ from dln_jax.mechanics.trees.motors import single_motors
 from dln_jax.types import InputError, require_positive
 
 LUMPS = "The inertia of all bodies that move with a joint is in the link behind it; links fixed to that link have none."
+Motor = tuple[np.ndarray, dict[str, float]]
+"""A motor that turns with several joints: its rate per joint rate, a row of S, and its constants by name."""
 COUPLED = "coupled_motor_"
 """Start of the names of fixed tendons that stand for motors that turn with several joints."""
 
@@ -66,7 +68,7 @@ def mjcf(robot: Robot, *, time_step: float = 0.001) -> str:
         kind = "hinge" if tree.joints[link] == "revolute" else "slide"
         ET.SubElement(bodies[-1], "joint", {"name": name, "type": kind, "axis": _text(tree.axes[link]), **stated})
         ET.SubElement(motors, "motor", name=f"motor_{name}", joint=name)
-    _tendons(root, names, [{"armature": I, "coefficients": c} for I, c in coupled])
+    _tendons(root, names, [(c, {"armature": inertia}) for inertia, c in coupled])
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
 
@@ -104,8 +106,8 @@ def write_robot(
     path, original = Path(path), Path(original)
     if path.exists() and original.exists() and path.samefile(original):
         raise InputError(f"{path} is the original file, which stays unchanged; give another name")
-    root = parsed(original)
-    _, model, locked = opened(original, copy.deepcopy(root), lock)
+    root = parse_robot(original)
+    _, model, locked = compile_robot(original, copy.deepcopy(root), lock)
     names = [name for name in joint_names(model) if name not in locked]
     if list(tree.names) != names:
         raise InputError(f"{original} has the joints {', '.join(names)}; the tree has {', '.join(tree.names)}")
@@ -125,9 +127,9 @@ def write_robot(
             remarks = (*remarks, f"Armature, which URDF cannot state (kg m² or kg): {numbers}.")
         for inertia, c in coupled:
             remarks = (*remarks, f"Armature of a motor at {_sum(c, names)}, which URDF lacks: {_text(inertia)}.")
-        for motor in of_motors:
-            losses = ", ".join(f"{key} {_text(value)}" for key, value in motor.items() if key != "coefficients")
-            remarks = (*remarks, f"Friction of a motor at {_sum(motor['coefficients'], names)}, likewise: {losses}.")
+        for c, losses in of_motors:
+            stated = ", ".join(f"{key} {_text(value)}" for key, value in losses.items())
+            remarks = (*remarks, f"Friction of a motor at {_sum(c, names)}, likewise: {stated}.")
         _into_urdf(root, tree, locked, **friction)
     else:
         if locked:
@@ -135,7 +137,7 @@ def write_robot(
                 f"{original}: bodies behind the locked joints of an MJCF file would have no mass; remove these joints"
             )
         _into_mjcf(original, root, model, tree._replace(armature=armature), **friction)
-        _tendons(root, names, [*of_motors, *({"armature": I, "coefficients": c} for I, c in coupled)])
+        _tendons(root, names, [*of_motors, *((c, {"armature": inertia}) for inertia, c in coupled)])
     comment = ET.Comment("\n  " + "\n  ".join(line.replace("--", "- -") for line in remarks) + "\n")
     comment.tail = "\n"
     root.insert(0, comment)
@@ -213,15 +215,15 @@ def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, *, damp
         body.insert(0, inertial)
 
 
-def _split(motors: Any, damping: Any, coulomb: Any) -> tuple[Any, Any, list[dict[str, Any]]]:
-    """Friction of joints with a motor of their own, and that of all other motors, by row of the matrix S."""
+def _split(motors: Any, damping: Any, coulomb: Any) -> tuple[Any, Any, list[Motor]]:
+    """Friction of joints with a motor of their own, and that of all other motors."""
     if motors is None:
         return damping, coulomb, []
     S = np.asarray(motors, float)
     own = (np.eye(len(S)) == S).all(axis=1)
     stated = {key: values for key, values in (("damping", damping), ("frictionloss", coulomb)) if values is not None}
     others = [
-        {"coefficients": S[k], **{key: float(values[k]) for key, values in stated.items()}}
+        (S[k], {key: float(values[k]) for key, values in stated.items()})
         for k in np.flatnonzero(~own)
         if any(values[k] for values in stated.values())
     ]
@@ -229,7 +231,7 @@ def _split(motors: Any, damping: Any, coulomb: Any) -> tuple[Any, Any, list[dict
     return first, second, others
 
 
-def _tendons(root: ET.Element, names: Sequence[str], motors: Sequence[Mapping[str, Any]]) -> None:
+def _tendons(root: ET.Element, names: Sequence[str], motors: Sequence[Motor]) -> None:
     """Replaces the fixed tendons of coupled motors, by name; others lose their armature, now part of the motors'."""
     group = root.find("tendon")
     for tendons in root.findall("tendon"):
@@ -237,11 +239,11 @@ def _tendons(root: ET.Element, names: Sequence[str], motors: Sequence[Mapping[st
             tendon.attrib.pop("armature", None)
             if (tendon.get("name") or "").startswith(COUPLED):
                 tendons.remove(tendon)
-    for number, motor in enumerate(motors, 1):
+    for number, (coefficients, constants) in enumerate(motors, 1):
         group = ET.SubElement(root, "tendon") if group is None else group
-        numbers = {key: _text(value) for key, value in motor.items() if key != "coefficients"}
+        numbers = {key: _text(value) for key, value in constants.items()}
         tendon = ET.SubElement(group, "fixed", {"name": f"{COUPLED}{number}", **numbers})
-        for name, coefficient in zip(names, motor["coefficients"], strict=True):
+        for name, coefficient in zip(names, coefficients, strict=True):
             if coefficient:
                 ET.SubElement(tendon, "joint", joint=name, coef=_text(coefficient))
 

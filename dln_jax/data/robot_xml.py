@@ -60,7 +60,7 @@ class _Elements(ET.TreeBuilder):
         return super().end(tag.rpartition("}")[2])
 
 
-def parsed(path: Path) -> ET.Element:
+def parse_robot(path: Path) -> ET.Element:
     """The root element of a URDF or MJCF file, comments included; errors as for `read_robot`."""
     root = _root(path)
     if root.tag not in ("robot", "mujoco"):
@@ -103,34 +103,28 @@ def link_inertias(root: ET.Element) -> dict[str, np.ndarray]:
     Raises:
         InputError: an <inertial> is incomplete, not numeric or has a negative mass.
     """
-    parameters = {}
-    for link in root.findall("link"):
-        inertial = link.find("inertial")
-        if inertial is not None:
-            name = link.get("name", "")
-            try:
-                parameters[name] = _parameters(inertial)
-            except (AttributeError, TypeError, ValueError):
-                raise InputError(
-                    f"link '{name}' has an <inertial> that is incomplete; expected a mass, not below zero, and six "
-                    "moments, all finite numbers"
-                ) from None
-    return parameters
-
-
-def _parameters(inertial: ET.Element) -> np.ndarray:
-    """Inertial parameters [10] in the frame of the link; raises `ValueError` and the like for a malformed element."""
     from scipy.spatial.transform import Rotation
 
-    origin, mass, inertia = (inertial.find(tag) for tag in ("origin", "mass", "inertia"))
-    m = float(mass.get("value"))  # type: ignore[union-attr, arg-type]
-    moments = np.array([[float(inertia.get(key)) for key in row] for row in MOMENTS])  # type: ignore[union-attr, arg-type]
-    stated = {} if origin is None else origin.attrib
-    xyz, rpy = (np.array(stated.get(key, "0 0 0").split(), float) for key in ("xyz", "rpy"))
-    if xyz.shape != (3,) or not (m >= 0 and np.isfinite([m, *moments.ravel(), *xyz, *rpy]).all()):
-        raise ValueError
-    turn = Rotation.from_euler("xyz", rpy).as_matrix()  # about the fixed axes x, y, z, in this order
-    return np.asarray(moved(inertial_parameters(m, np.zeros(3), moments), turn, xyz))
+    parameters = {}
+    for link in root.findall("link"):
+        inertial, name = link.find("inertial"), link.get("name", "")
+        if inertial is None:
+            continue
+        origin, mass, inertia = (
+            {} if part is None else part.attrib for part in map(inertial.find, ("origin", "mass", "inertia"))
+        )
+        m = _number(mass.get("value", ""))
+        moments = np.array([[_number(inertia.get(key, "")) for key in row] for row in MOMENTS])
+        xyz, rpy = ([_number(text) for text in origin.get(key, "0 0 0").split()] for key in ("xyz", "rpy"))
+        if not (len(xyz) == len(rpy) == 3 and m >= 0 and np.isfinite([m, *moments.ravel(), *xyz, *rpy]).all()):
+            raise InputError(
+                f"link '{name}' has an <inertial> that is incomplete; expected a mass, not below zero, and six "
+                "moments, all finite numbers"
+            )
+        turn = Rotation.from_euler("xyz", rpy).as_matrix()  # about the fixed axes x, y, z, in this order
+        theta = inertial_parameters(m, np.zeros(3), moments)
+        parameters[name] = np.asarray(moved(theta, turn, np.array(xyz)))
+    return parameters
 
 
 def without_shapes(root: ET.Element, *, inertias: bool) -> ET.Element:

@@ -18,7 +18,7 @@ from dln_jax.data.robot_xml import (
     MOST_JOINTS,
     check_joints,
     link_inertias,
-    parsed,
+    parse_robot,
     require_range,
     velocity_limits,
     without_shapes,
@@ -62,11 +62,11 @@ def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = 
             revolute, continuous nor prismatic, mimics another, has a spring, or has limits that are NaN, equal,
             swapped or half stated; a joint to lock does not exist; no joint moves; or a moving link has no mass.
     """
-    path, root = Path(path), parsed(Path(path))
+    path, root = Path(path), parse_robot(Path(path))
     try:
         in_urdf = root.tag == "robot"
         inertias, speeds = (link_inertias(root), velocity_limits(root)) if in_urdf else (None, {})
-        mujoco, model, locked = opened(path, root, lock)
+        mujoco, model, locked = compile_robot(path, root, lock)
         robot = robot_of(mujoco, model, locked, inertias)
         limits = np.array([speeds.get(name, np.inf) for name in robot.tree.names])
         return robot._replace(velocity_limits=limits) if in_urdf else robot
@@ -74,7 +74,7 @@ def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = 
         raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
 
 
-def opened(
+def compile_robot(
     path: Path, root: ET.Element, lock: Mapping[str, float] | Sequence[str], *, inertias: bool = False
 ) -> tuple[Any, Any, dict[str, float]]:
     """MuJoCo, its model of the file with this root element, and the positions of locked joints by name.
@@ -82,15 +82,25 @@ def opened(
     For a URDF, shapes are left out, and inertias are placeholders unless they are asked for, as by a simulation: MuJoCo
     refuses those that are not physically consistent. Errors as for `read_robot`.
     """
+    refusal = f"{path}: MuJoCo cannot compile it"
     if root.tag == "mujoco":
-        mujoco, model = _compiled(path, root, (), inertias)
+        mujoco, model = compiled_model(path, refusal)
         locked = _matching(lock, joint_names(model))
         check_joints(path, root, locked)
         require_ranges(model, locked)
         return mujoco, model, locked
     locked = _matching(lock, [joint.get("name", "") for joint in root.findall("joint")])
     check_joints(path, root, locked)
-    return (*_compiled(path, root, locked, inertias), locked)
+    for joint in root.iter("joint"):
+        for mimic in joint.findall("mimic"):
+            if joint.get("name") not in locked:
+                raise InputError(
+                    f"{path}: joint '{joint.get('name')}' follows another (mimic); expected joints that move freely: "
+                    "lock it, and the joint that it follows"
+                )
+            joint.remove(mimic)
+    source = ET.tostring(without_shapes(root, inertias=inertias), encoding="unicode")
+    return (*compiled_model(source, refusal), locked)
 
 
 def joint_names(model: Any) -> list[str]:
@@ -139,21 +149,6 @@ def compiled_model(source: Any, refusal: str = "MuJoCo refuses the model") -> tu
             return mujoco, make(str(source))
     except (ValueError, RuntimeError, mujoco.FatalError, mujoco.UnexpectedError) as error:
         raise InputError(f"{refusal}: {' '.join(str(error).split()):.300}") from None
-
-
-def _compiled(path: Path, root: ET.Element, locked: Collection[str], inertias: bool) -> tuple[Any, Any]:
-    source = path
-    if root.tag == "robot":
-        for joint in root.iter("joint"):
-            for mimic in joint.findall("mimic"):
-                if joint.get("name") not in locked:
-                    raise InputError(
-                        f"{path}: joint '{joint.get('name')}' follows another (mimic); expected joints that move "
-                        "freely: lock it, and the joint that it follows"
-                    )
-                joint.remove(mimic)
-        source = ET.tostring(without_shapes(root, inertias=inertias), encoding="unicode")
-    return compiled_model(source, f"{path}: MuJoCo cannot compile it")
 
 
 @contextlib.contextmanager

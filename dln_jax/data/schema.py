@@ -16,26 +16,29 @@ Samples of all trajectories are concatenated on axis 0.
 | `needs` | str | | optional JSON of `dln_jax.types.Needs` |
 """
 
-import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from dln_jax.data import bags, csv_tables, joint_names
-from dln_jax.data.arrays import FOLDER, load_file, numeric, unread_line
-from dln_jax.data.schema_keys import KEYS, OPTIONAL, RATES
-from dln_jax.data.stated_facts import scaled, with_chosen, with_times
+from dln_jax.data import bags, csv_tables
+from dln_jax.data.arrays import load_file, numeric, unread_line
+from dln_jax.data.joint_names import OPTIONAL, PER_JOINT, match_names, scale_torques, select_names, with_selected_joints
 from dln_jax.data.stated_needs import needs_from_text
-from dln_jax.data.trajectory_times import require_increasing_time, time_derivative, trajectory_names, unwrapped
 from dln_jax.files import is_file, is_folder, writing
-from dln_jax.types import InputError, Needs
+from dln_jax.types import InputError, Needs, require_positive
 
-Data = TypeVar("Data")
+KEYS = ("t", *PER_JOINT, "trajectory", "label", "joint_names", "needs")
+RATES = {"qd": "q", "qdd": "qd"}
+"""Rates, and what they are derivatives of."""
 ABSOLUTE_ZERO = -273.15
 """°C."""
+LARGEST_INDEX = 2**53
+"""float64 is exact for integers up to this one."""
+LONG = np.pi / 4
+"""rad: usual steps of angles are shorter."""
 
 
 class Trajectories(NamedTuple):
@@ -77,6 +80,7 @@ def load(
     topics: Sequence[str] = (),
     torque_factor: float | int | Sequence[float | int] | Mapping[str, float | int] | None = None,
     robot: Sequence[str] = (),
+    repair: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
 ) -> Trajectories:
     """Reads and checks an npz file, a CSV file or a ROS bag; never unpickles.
 
@@ -84,52 +88,57 @@ def load(
         path: .csv for CSV (see `data.csv_tables`); .db3, .mcap, .bag or a folder for a bag (see `data.bags`).
         rate: sampling rate of all trajectories, Hz, for a file without t.
         units: units of CSV titles without one, "si" or "degrees".
-        joints: names of joints to keep, in this order, or LOG=NEW to rename one (see `data.joint_names.chosen`).
+        joints: names of joints to keep, in this order, or LOG=NEW to rename one (see `data.joint_names.select_names`).
         topics: topics of joint states in a bag; by default the only one.
         torque_factor: factor of tau, N m per A for currents: one number, one for each joint, or numbers by name.
         robot: names of the robot's joints; of a bag only those are read (`splits.with_joints` orders them).
+        repair: changes the arrays of the file before they are checked.
 
     Raises:
         InputError: the file is missing, damaged or pickled, breaks the schema, or lacks a stated joint or topic.
     """
-    stated = {"joints": joints, "topics": topics, "torque_factor": torque_factor, "robot": robot}
-    return load_arrays(path, from_arrays, rate=rate, units=units, **stated)
-
-
-def load_arrays(
-    path: str | Path,
-    from_arrays: Callable[[dict[str, Any]], Data],
-    *,
-    rate: float | int | None = None,
-    units: str | None = None,
-    joints: Sequence[str] = (),
-    topics: Sequence[str] = (),
-    torque_factor: Any = None,
-    robot: Sequence[str] = (),
-) -> Data:
-    """Result of `from_arrays` on a file's arrays, completed with t and trajectory; arguments and errors: see `load`."""
-    suffix, folder = Path(path).suffix.lower(), is_folder(Path(path))
+    suffix = Path(path).suffix.lower()
+    of_bag = is_folder(Path(path)) or suffix in bags.SUFFIXES
     if units is not None and suffix != ".csv":
         raise InputError(f"{path!s:.200}: units are for CSV; npz files and bags are in SI units")
-    of_bag = folder or suffix in bags.SUFFIXES
     if topics and not of_bag:
         raise InputError(f"{path!s:.200}: --topics is for ROS bags; leave it out")
 
-    def choose(own: Sequence[str]) -> Sequence[str]:
-        kept = joint_names.chosen(own, joints)
-        if not robot:
-            return kept.own
-        by_name = dict(zip(kept.names, kept.own, strict=True))
-        return [by_name[name] for name in joint_names.matched(kept.names, robot).values()]
+    def select(own: Sequence[str]) -> dict[str, str]:
+        selected = select_names(own, joints)
+        by_name = {name: old for old, name in selected.items()}
+        return {by_name[name]: name for name in match_names(list(by_name), robot).values()} if robot else selected
 
-    of_bags = functools.partial(bags.read, topics=topics, choose=choose)
-    of_csv = functools.partial(csv_tables.read, units=units)
-    readers = {".csv": of_csv, **dict.fromkeys((*bags.SUFFIXES, FOLDER), of_bags)}
+    def of_file(arrays: dict[str, Any]) -> Trajectories:
+        arrays = _with_times(arrays, rate)
+        arrays = scale_torques(arrays if of_bag else with_selected_joints(arrays, joints), torque_factor)
+        return from_arrays(arrays if repair is None else repair(arrays))
 
-    def completed(arrays: dict[str, Any]) -> Data:
-        return from_arrays(scaled(with_chosen(with_times(arrays, rate), joints, of_bag), torque_factor))
+    reader = (lambda bag: bags.read(bag, topics=topics, select=select)) if of_bag else None
+    if suffix == ".csv" and not of_bag:
+        reader = lambda table: csv_tables.read(table, units=units)  # noqa: E731
+    return load_file(path, of_file, KEYS, reader=reader)
 
-    return load_file(path, completed, KEYS, readers=readers)
+
+def _with_times(arrays: dict[str, Any], rate: float | int | None) -> dict[str, Any]:
+    """Completes the arrays with t, from the rate, and with trajectory, as one recording, if they are absent.
+
+    Raises:
+        InputError: there is neither t nor a rate, there are both, or the rate is not positive.
+    """
+    if "q" not in arrays:
+        return arrays  # `from_arrays` refuses them
+    samples = len(np.atleast_1d(np.asarray(arrays["q"])))
+    if rate is None and "t" not in arrays:
+        raise InputError("key 't' is missing; add the time of each sample in seconds, or give --rate HZ")
+    arrays = {"trajectory": np.zeros(samples, int), **arrays}
+    if rate is None:
+        return arrays
+    require_positive(rate=rate)
+    if "t" in arrays:
+        raise InputError("the file has t, so its rate is known; leave --rate out")
+    starts = np.flatnonzero(np.diff(np.asarray(arrays["trajectory"]), prepend=np.nan))
+    return {**arrays, "t": (np.arange(samples) - np.repeat(starts, np.diff(starts, append=samples))) / rate}
 
 
 def column(data: Trajectories, key: str) -> np.ndarray:
@@ -145,43 +154,125 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
     q = numeric(arrays, "q")
     if q.ndim != 2 or q.shape[1] == 0:
         raise InputError(f"q has shape {q.shape}; expected [N, d] with d >= 1: one column per coordinate")
-    samples = q.shape[0]
+    samples, d = q.shape
     if samples < 2:
         raise InputError(f"q has {samples} sample(s); expected at least 2: record longer trajectories")
     t = numeric(arrays, "t", (samples,))
-    trajectory, label = trajectory_names(arrays, samples)
-    require_increasing_time(t, trajectory, label)
-
+    trajectory, label = _named_trajectories(arrays, t)
     needs = needs_from_text(str(arrays["needs"])) if "needs" in arrays else None
-    if needs is not None and needs.degrees_of_freedom != q.shape[1]:
-        raise InputError(
-            f"needs states {needs.degrees_of_freedom} joints, but q has {q.shape[1]} columns; make them agree"
-        )
-    turning = ["revolute"] * q.shape[1] if needs is None else needs.joints
-    q, wraps = unwrapped(q, trajectory, np.array(turning) == "revolute")
-    checked = {"q": q} | {key: numeric(arrays, key, q.shape) for key in (*RATES, *OPTIONAL) if key in arrays}
+    if needs is not None and needs.degrees_of_freedom != d:
+        raise InputError(f"needs states {needs.degrees_of_freedom} joints, but q has {d} columns; make them agree")
+    turning = ["revolute"] * d if needs is None else needs.joints
+    q, wraps = _unwrap(q, trajectory, np.array(turning) == "revolute")
+    temperature = arrays.get("temperature")
+    if temperature is not None:
+        temperature = np.asarray(temperature)
+        common = temperature.ndim == 1 or (temperature.ndim == 2 and temperature.shape[1] == 1)
+        stated = {"temperature": temperature.reshape(-1) if common else temperature}
+        temperature = numeric(stated, "temperature", (samples,) if common else q.shape)
+        if temperature.min() < ABSOLUTE_ZERO:
+            raise InputError(
+                f"temperature is {temperature.min():.3g} °C, below absolute zero; expected degrees Celsius"
+            )
+        temperature = np.broadcast_to(temperature[:, None], q.shape).copy() if common else temperature
+    checked = {key: numeric(arrays, key, q.shape) for key in OPTIONAL if key in arrays} | {"q": q}
     estimated = tuple(key for key in (*RATES, "tau") if key not in arrays)
-    for key, source in zip(RATES, ("q", "qd"), strict=True):
+    for key, source in RATES.items():
         if key in estimated:
             checked[key] = time_derivative(t, checked[source], trajectory, name=key)
     checked.setdefault("tau", np.zeros_like(q))
-    if arrays.get("temperature") is not None:
-        checked["temperature"] = _temperature(arrays, q.shape)
-    names = _joint_names(arrays["joint_names"], q.shape[1]) if "joint_names" in arrays else None
+    names = arrays.get("joint_names")
+    if names is not None:
+        names = np.asarray(names)
+        if names.dtype.kind not in "US" or names.shape != (d,) or len(set(names.tolist())) < d:
+            stated = f"type {names.dtype} and shape {names.shape}"
+            raise InputError(f"joint_names has {stated}; expected {d} different strings")
+        names = names.astype(str)
     return Trajectories(
         t=t, trajectory=trajectory, label=label, needs=needs, joint_names=names, estimated=estimated,
-        remarks=(*unread_line(arrays), *arrays.get("remarks", ()), *wraps), **checked,
+        temperature=temperature, remarks=(*unread_line(arrays), *arrays.get("remarks", ()), *wraps), **checked,
     )  # fmt: skip
 
 
-def _temperature(arrays: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray:
-    """Temperatures [N, d], from one for each joint or one for all."""
-    stated = np.asarray(arrays["temperature"])
-    common = stated.ndim == 1 or (stated.ndim == 2 and stated.shape[1] == 1)
-    values = numeric({"temperature": stated.reshape(-1) if common else stated}, "temperature", shape[: 2 - common])
-    if values.min() < ABSOLUTE_ZERO:
-        raise InputError(f"temperature is {values.min():.3g} °C, below absolute zero; expected degrees Celsius")
-    return np.broadcast_to(values[:, None], shape).copy() if common else values
+def _named_trajectories(arrays: dict[str, Any], t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Index of every sample's trajectory and the trajectories' names; raises `InputError` for invalid ones.
+
+    The samples of each trajectory must be together and in the order of time.
+    """
+    trajectory = numeric(arrays, "trajectory", t.shape, most=np.inf)
+    if (trajectory != np.round(trajectory)).any() or trajectory.min() < 0 or trajectory.max() > LARGEST_INDEX:
+        raise InputError("trajectory has entries that are not whole numbers >= 0; give the index of each trajectory")
+    trajectory = trajectory.astype(np.int64)
+    if "label" not in arrays:
+        present, trajectory = np.unique(trajectory, return_inverse=True)
+        trajectory, label = trajectory.reshape(-1), present.astype(str)
+    else:
+        count = int(trajectory.max()) + 1
+        try:
+            label = np.asarray(arrays["label"])
+        except ValueError as error:
+            raise InputError("label is ragged; expected one string per trajectory") from error
+        if label.dtype.kind not in "US" or label.ndim != 1:
+            stated = f"type {label.dtype} and shape {label.shape}"
+            raise InputError(f"label has {stated}; expected one string per trajectory")
+        if len(label) < count:
+            stated = f"names {len(label)} trajectories, but trajectory counts {count}"
+            raise InputError(f"label {stated}; add the missing names")
+        if len(set(label)) < len(label):
+            raise InputError("label has repeated names; give every trajectory a name of its own")
+        label = label.astype(str)
+    same = trajectory[1:] == trajectory[:-1]
+    starts = trajectory[np.flatnonzero(np.r_[True, ~same])]
+    if len(set(starts)) < len(starts):
+        raise InputError("trajectory returns to an earlier index; keep the samples of each trajectory together")
+    for sample in 1 + np.flatnonzero(same & (np.diff(t) <= 0))[:1]:
+        raise InputError(
+            f"t does not increase at sample {sample} of trajectory '{label[trajectory[sample]]}'; sort the samples by "
+            "time, and number recordings that follow one another in a column 'trajectory'"
+        )
+    return trajectory, label
+
+
+def _unwrap(q: np.ndarray, trajectory: np.ndarray, revolute: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Angles without the jumps by 2 pi of sensors that wrap, and remarks on them.
+
+    A joint is left alone if a step beside its jumps, or more than one in a hundred, is long: turns could be motions.
+
+    Args:
+        q: [N, d].
+        trajectory: index of every sample's trajectory [N].
+        revolute: joints that turn [d].
+    """
+    ends = np.flatnonzero(np.diff(trajectory)) + 1
+    straight = np.concatenate([np.unwrap(part, axis=0) for part in np.split(q, ends)])
+    turned, step = (np.abs(np.delete(np.diff(x, axis=0), ends - 1, axis=0)) for x in (straight - q, straight))
+    jumps, far = turned > 1, step > LONG
+    wraps = revolute & jumps.any(axis=0) & ~(jumps & far).any(axis=0) & (far.sum(axis=0) < len(far) / 100)
+    if not wraps.any():
+        return q, []
+    columns = ", ".join(str(joint + 1) for joint in np.flatnonzero(wraps))
+    return np.where(wraps, straight, q), [f"angles in column {columns} of q wrap by 2 pi and are unwrapped"]
+
+
+def time_derivative(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, *, name: str) -> np.ndarray:
+    """Second-order finite differences of values [N, d] over t [N], trajectory by trajectory.
+
+    Central inside, one-sided at the ends, any spacing; differences never reach across trajectories.
+
+    Raises:
+        InputError: a trajectory has fewer than three samples; the message names `name`, the key to be estimated.
+    """
+    result = np.empty_like(values)
+    for index in np.unique(trajectory):
+        samples = trajectory == index
+        count = int(samples.sum())
+        if count < 3:
+            raise InputError(
+                f"{name} is missing, and trajectory {index} has {count} sample(s): estimating it takes at least 3; "
+                f"add {name} or record longer trajectories"
+            )
+        result[samples] = np.gradient(values[samples], t[samples], axis=0, edge_order=2)
+    return result
 
 
 def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> None:
@@ -220,10 +311,3 @@ def momenta(data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
             "a field is fitted to p and pd, which the data do not have; add them, or fit trajectories instead"
         )
     return data.p, data.pd
-
-
-def _joint_names(stated: Any, d: int) -> np.ndarray:
-    names = np.asarray(stated)
-    if names.dtype.kind not in "US" or names.shape != (d,) or len(set(names.tolist())) < d:
-        raise InputError(f"joint_names has type {names.dtype} and shape {names.shape}; expected {d} different strings")
-    return names.astype(str)

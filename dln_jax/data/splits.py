@@ -11,9 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from dln_jax.data.joint_names import matched
+from dln_jax.data.joint_names import PER_JOINT, match_names
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.schema_keys import PER_JOINT
 from dln_jax.types import InputError, require_positive, require_seed
 
 PER_SAMPLE = ("t", "trajectory", *PER_JOINT)
@@ -54,7 +53,7 @@ def every(data: Trajectories, step: int) -> Trajectories:
 def with_joints(data: Trajectories, names: Sequence[str]) -> Trajectories:
     """Selects, orders and renames the columns of the data as these joints; data without joint names stay unchanged.
 
-    Remarks say which names were matched (see `data.joint_names.matched`), and how far joints moved that are left out.
+    Remarks say which names were matched (see `data.joint_names`), and how far joints moved that are left out.
 
     Raises:
         InputError: the names do not match; or there are none, and the number of joints differs.
@@ -65,7 +64,7 @@ def with_joints(data: Trajectories, names: Sequence[str]) -> Trajectories:
     if data.joint_names is None:
         return data
     own = data.joint_names.tolist()
-    match = matched(own, names)
+    match = match_names(own, names)
     order = [own.index(match[name]) for name in names]
     remarks = list(data.remarks)
     if any(name != other for name, other in match.items()):

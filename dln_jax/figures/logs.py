@@ -4,9 +4,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dln_jax.data.checks.hypotheses import Torques
-from dln_jax.data.checks.validation import Examination
-from dln_jax.data.encoders.cutoff import Choice
+from dln_jax.data.checks.report import Examination
+from dln_jax.data.checks.torques import Torques
+from dln_jax.data.encoders.filters import Choice
 from dln_jax.data.encoders.smoothing import Smoothed
 from dln_jax.data.schema import Trajectories
 from dln_jax.figures import style
@@ -34,7 +34,7 @@ def cutoff_figure(smoothed: Smoothed) -> Figure:
 
 def log_figure(examined: Examination) -> Figure:
     """One page: spectra and cut-off, time steps or delay, and friction against velocity for every joint."""
-    data, smoothed, torques = examined.recording.data, examined.smoothed, examined.torques
+    data, smoothed, torques = examined.data, examined.smoothed, examined.torques
     joints = 0 if torques is None or smoothed is None else min(data.degrees_of_freedom, MOST_JOINTS)
     rows = 1 + -(-joints // COLUMNS)
     figure, axes = style.figure(rows, COLUMNS, height=2.3 * rows + 0.3)
@@ -51,7 +51,7 @@ def log_figure(examined: Examination) -> Figure:
         return figure
     _delays(axes[0, 2], torques, smoothed.rate)
     for joint, axis in enumerate(axes[1:].flat[:joints]):
-        _friction(axis, torques, smoothed.data.qd[torques.rows, joint], joint)
+        _friction(axis, torques, smoothed.data.qd[torques.repaired.log.rows, joint], joint)
         if joint % COLUMNS == 0:
             axis.set_ylabel("friction and error, N m")
     return figure

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
-from dln_jax.data.encoders.sampling import delayed
+from dln_jax.data.encoders.sampling import delay_held
 from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import segments
@@ -137,7 +137,7 @@ def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
     acting = np.zeros_like(data.tau)
     for index in np.unique(data.trajectory):
         rows = np.flatnonzero(data.trajectory == index)
-        steps = delayed(data.tau[rows], float(delay))
+        steps = delay_held(data.tau[rows], float(delay))
         acting[rows] = (np.concatenate([np.zeros_like(steps[:1]), steps[:-1]]) + steps) / 2
     return data._replace(tau=acting)
 

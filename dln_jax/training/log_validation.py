@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.data.checks.validation import Examination, Recording, examine, read, report
+from dln_jax.data.checks.report import Examination, examine, read, report
 from dln_jax.data.robots import read_robot
+from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import with_joints
 from dln_jax.figures.logs import log_figure
 from dln_jax.files import write_bytes, write_figure, write_json
@@ -23,8 +24,8 @@ def validate(options: Any) -> None:
         refuse_given(options, ["lock"], "for joints of --robot")
     robot = None if options.robot is None else read_robot(options.robot, lock=names_listed(options.lock))
     names = () if robot is None else robot.tree.names
-    recording = for_robot(read(options.data, **facts(options), robot=names), names)
-    examined = examine(recording, robot)
+    data, repaired = read(options.data, **facts(options), robot=names)
+    examined = examine(for_robot(data, names), robot, repaired=repaired)
     lines = report(examined, str(options.data))
     with command_folder(options, "check_data") as folder:
         print("\n".join(lines))
@@ -38,14 +39,13 @@ def validate(options: Any) -> None:
         raise SystemExit(1)
 
 
-def for_robot(recording: Recording, names: Sequence[str]) -> Recording:
-    """The recording with the robot's joints, if their names match; else unchanged, which the checks then report."""
-    own = recording.data.joint_names
-    if not names or own is None or set(names) == set(own):
-        return recording
+def for_robot(data: Trajectories, names: Sequence[str]) -> Trajectories:
+    """The log with the robot's joints, if their names match; else unchanged, which the checks then report."""
+    if not names or data.joint_names is None or set(names) == set(data.joint_names):
+        return data
     with contextlib.suppress(InputError):
-        return recording._replace(data=with_joints(recording.data, names))
-    return recording
+        return with_joints(data, names)
+    return data
 
 
 def metrics(examined: Examination) -> dict[str, Any]:

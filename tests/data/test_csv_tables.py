@@ -7,7 +7,7 @@ from calls import one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.data import csv_tables, schema
-from dln_jax.data.checks.validation import read
+from dln_jax.data.checks.report import read
 from dln_jax.data.csv_tables import write_motion
 from dln_jax.data.splits import select_samples
 
@@ -35,7 +35,7 @@ def test_columns_come_in_any_order_as_the_arrays_of_an_npz_file(load, tmp_path):
         assert_array_equal(one, other)
     shuffled = load("tau2_Nm,note,q2_rad,q1_rad,t_s,tau1_Nm\n4,fine,2,1,0,3\n8,,6,5,0.1,7\n12,a b,10,9,0.2,11\n")
     jax.tree.map(assert_array_equal, shuffled._replace(remarks=()), plain)
-    assert read(tmp_path / "log.csv").data.remarks == shuffled.remarks == ("not read: note",)
+    assert read(tmp_path / "log.csv")[0].remarks == shuffled.remarks == ("not read: note",)
 
 
 def test_every_column_that_is_not_read_is_named(load):

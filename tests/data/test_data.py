@@ -10,7 +10,6 @@ from dln_jax import Needs
 from dln_jax.data import schema
 from dln_jax.data.splits import PER_SAMPLE, merged, select, split
 from dln_jax.data.stated_needs import needs_from_json
-from dln_jax.data.trajectory_times import time_derivative
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum, two_link_arm
 from dln_jax.scenes.poles import cart_pole
@@ -91,7 +90,7 @@ def test_absent_rates_are_estimated_to_second_order_and_never_across_trajectorie
         errors.append(np.abs(data.qd[:, 0] - 3 * np.cos(phase)).max())
     assert errors[1] < 0.35 * errors[0]
     with one_line("qd is missing, and trajectory 0 has 2"):
-        time_derivative(np.arange(2.0), np.zeros((2, 1)), np.zeros(2, int), name="qd")
+        schema.time_derivative(np.arange(2.0), np.zeros((2, 1)), np.zeros(2, int), name="qd")
 
 
 def test_split_is_by_trajectory_disjoint_complete_and_seeded():
@@ -124,7 +123,7 @@ def test_letters_have_exact_rates_and_momenta_and_torques_that_are_sums():
         data = generators.characters(letters="e", dt=dt)
         assert_allclose(data.tau_inertial + data.tau_coriolis + data.tau_gravity, data.tau, atol=1e-12)
         for rate, source in (("qd", "q"), ("qdd", "qd"), ("pd", "p")):
-            estimate = time_derivative(data.t, getattr(data, source), data.trajectory, name=rate)
+            estimate = schema.time_derivative(data.t, getattr(data, source), data.trajectory, name=rate)
             errors.append(np.abs(estimate - getattr(data, rate))[2:-2].max())
     coarse, fine = np.array(errors).reshape(2, 3)
     assert (fine < 0.35 * coarse).all() and (fine < 0.1).all()

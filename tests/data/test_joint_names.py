@@ -5,7 +5,7 @@ from calls import one_line
 from numpy.testing import assert_array_equal
 
 from dln_jax.data import schema
-from dln_jax.data.joint_names import chosen, factors, matched
+from dln_jax.data.joint_names import match_names, scale_torques, select_names
 from dln_jax.data.splits import in_blocks, with_joints
 
 ARRAYS = {
@@ -26,20 +26,24 @@ def test_names_match_if_one_prefix_or_ending_is_replaced():
         (["A1", "A2"], ["joint_a1", "joint_a2"], ["A1", "A2"]),
         (["j1", "j11", "j12"], ["j1", "j11"], ["j1", "j11"]),
     ):
-        assert list(matched(own, wanted).values()) == expected
+        assert list(match_names(own, wanted).values()) == expected
 
 
 def test_statements_about_joints_are_checked():
-    assert chosen(["a", "b", "c"], ["c", "a=x"]) == (("c", "a"), ("c", "x"))
-    assert factors({"b": -2}, ["a", "b"]) == [1.0, -2.0]
+    assert select_names(["a", "b", "c"], ["c", "a=x"]) == {"c": "c", "a": "x"}
+    arrays = {"tau": np.ones((1, 2)), "joint_names": ["a", "b"]}
+    assert scale_torques(arrays, {"b": -2})["tau"].tolist() == [[1.0, -2.0]]
     three, arms = ["a", "b", "c"], ["left_elbow", "left_wrist", "right_elbow", "right_wrist"]
     for call, words in (
-        (lambda: chosen(three, ["d"]), "'d' is not among"),
-        (lambda: chosen(three, ["a="]), "lacks a name"),
-        (lambda: chosen(three, ["a", "a"]), "names a joint twice"),
-        (lambda: factors(0.0, ["a"]), "zero"),
-        (lambda: matched(["elbow", "hip"], ["knee", "hip"]), r"'knee' is not among the data's \(elbow, hip\)"),
-        (lambda: matched(arms, ["elbow", "wrist"]), r"in more than one way \(left_elbow=elbow, .*; right_elbow=elbow"),
+        (lambda: select_names(three, ["d"]), "'d' is not among"),
+        (lambda: select_names(three, ["a="]), "lacks a name"),
+        (lambda: select_names(three, ["a", "a"]), "names a joint twice"),
+        (lambda: scale_torques(arrays, 0.0), "zero"),
+        (lambda: match_names(["elbow", "hip"], ["knee", "hip"]), r"'knee' is not among the data's \(elbow, hip\)"),
+        (
+            lambda: match_names(arms, ["elbow", "wrist"]),
+            r"more than one way \(left_elbow=elbow, .*; right_elbow=elbow",
+        ),
         (lambda: with_joints(NAMED, ("elbow", "slide", "wrist")), "have 2 joints, the robot 3"),
         (lambda: with_joints(NAMED, ("elbow", "wrist")), "'wrist' is not among"),
         (lambda: in_blocks(NAMED, 7), "has 6 samples; expected at least 7"),

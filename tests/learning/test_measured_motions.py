@@ -8,7 +8,7 @@ from calls import one_line
 from jax.flatten_util import ravel_pytree
 
 from dln_jax.data import schema
-from dln_jax.data.encoders.local_polynomials import smooth_locally
+from dln_jax.data.encoders.smoothing import smooth_locally
 from dln_jax.learning import measured_motions
 from dln_jax.learning.measured_motions import Gauge, Noise, cut_measured_windows, motion
 from dln_jax.mechanics.equations import dynamics

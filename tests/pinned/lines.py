@@ -22,7 +22,7 @@ from planar_arm import URDF
 import dln_jax
 from dln_jax.commands import COMMANDS
 from dln_jax.data import schema
-from dln_jax.data.checks.validation import quick
+from dln_jax.data.checks.report import quick
 from dln_jax.data.splits import split
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum, two_link_arm

@@ -20,7 +20,7 @@ from jax import Array
 from dln_jax.control.estimate.extended import extended
 from dln_jax.control.estimate.loop import filtered
 from dln_jax.control.estimate.process import Belief, Filter, Innovation, Process, belief, mechanical
-from dln_jax.data.encoders.sampling import delayed, held_at_equal_steps, noise_of, step_of, timing
+from dln_jax.data.encoders.sampling import delay_held, held_at_equal_steps, noise_of, step_of, timing
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import segments
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
@@ -164,7 +164,7 @@ def from_log(
         q, tau = log.q[piece[:samples]], log.tau[piece[:samples]]
         start = np.concatenate([q[0], np.zeros_like(q[0])])
         deviation = np.concatenate([np.maximum(noise, step_of(log.q)), np.full(len(noise), FIRST_RATE)])
-        logs.append((belief(start, deviation), jnp.asarray(q), jnp.asarray(delayed(tau, float(delay)))))
+        logs.append((belief(start, deviation), jnp.asarray(q), jnp.asarray(delay_held(tau, float(delay)))))
     result = tuned(first, logs)
     whole = mechanical(
         model, actuation, rate=rate, band=result.process.disturbance, encoder_noise=noise, substeps=substeps

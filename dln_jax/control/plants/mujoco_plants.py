@@ -11,8 +11,8 @@ from dln_jax.control.mujoco_loop import advance, sampling
 from dln_jax.control.plants.plant import Layout, Plant, layout
 from dln_jax.control.plants.postures import extremes
 from dln_jax.control.plants.simulated import simulated
-from dln_jax.data.robot_xml import driven_joints, parsed, velocity_limits
-from dln_jax.data.robots import Robot, compiled_model, joint_names, opened, quiet, require_ranges, robot_of
+from dln_jax.data.robot_xml import driven_joints, parse_robot, velocity_limits
+from dln_jax.data.robots import Robot, compile_robot, compiled_model, joint_names, quiet, require_ranges, robot_of
 from dln_jax.types import InputError
 
 MOST_JOINTS = 4
@@ -175,8 +175,8 @@ def _require_known_forces(mujoco: Any, model: Any) -> None:
 def _model(source: Any) -> tuple[Any, Any, dict[str, float], list[str]]:
     """Returns MuJoCo, its model, and what a URDF states besides: largest rates by joint, joints with a transmission."""
     if isinstance(source, Path) or (isinstance(source, str) and not source.lstrip().startswith("<")):
-        root = parsed(Path(source))
-        mujoco, model = opened(Path(source), root, (), inertias=True)[:2]
+        root = parse_robot(Path(source))
+        mujoco, model = compile_robot(Path(source), root, (), inertias=True)[:2]
         if root.tag != "robot":
             return mujoco, model, {}, []
         # A URDF by itself states no integrator, and MuJoCo's default has errors that no rigid body makes.

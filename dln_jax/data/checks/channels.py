@@ -1,12 +1,19 @@
-"""Checks of the sampling times and of single channels: motionless joints, coarse steps, spikes and saturation."""
+"""Findings about data, and checks of sampling times, of single channels, and of qd and qdd against derivatives of q."""
+
+from typing import Literal, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
-from dln_jax.data.checks.findings import Finding, on_joints
 from dln_jax.data.encoders.sampling import step_of, timing
+from dln_jax.data.encoders.smoothing import PART, Smoothed
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import LEAST_TRAJECTORIES
 
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+"""error: a model learned from the data would be wrong, so commands that learn stop; warning: it would be less accurate
+than possible; note: for information."""
 JITTER = 0.05
 """Largest standard deviation of the steps, relative to the step."""
 SLOWEST = 1.0
@@ -33,28 +40,78 @@ FAST, HIDDEN = 0.3, 0.5
 """A joint moves if it is faster than the first multiple of its root mean square speed; zero torques in a larger share
 of such samples than the second are reported."""
 FILTER = "interpolate to equal steps with smooth() or --cutoff auto"
+RADIAN = 180 / np.pi
+ALIKE = 0.9
+"""Two signals with a higher correlation, after scaling and delay, count as equal."""
+UNLIKE = 0.5
+"""Two signals with a lower correlation count as unrelated."""
+EXCHANGED = 0.3
+"""qd and qdd count as exchanged if the error as the other rate is below this fraction of the error as their own."""
+LATE = 0.5
+"""Smallest delay reported, in samples."""
+FARTHEST = 0.25
+"""s: largest delay tested."""
+TINY = np.finfo(float).tiny
+RATE_REMEDY = "let --cutoff auto derive qd and qdd from q"
+
+
+class Finding(NamedTuple):
+    """A finding, shown to the user as one line."""
+
+    severity: Severity
+    check: str
+    """Stable lower-case name of the check."""
+    observation: str
+    """The observation, with numbers."""
+    remedy: str
+    joints: tuple[int, ...] = ()
+    """Joints concerned, counted from 0; empty if the finding concerns the whole log."""
+
+    @property
+    def line(self) -> str:
+        """The finding as one line of text."""
+        return f"{self.severity}: {self.observation}; {self.remedy}"
+
+
+def on_joints(
+    severity: Severity, check: str, concerned: Bool[np.ndarray, " d"], observation: str, remedy: str
+) -> list[Finding]:
+    """A finding about the joints in a mask; empty without such joints.
+
+    "joint 3" or "joints 1, 2 and 4", counted from 1 as in figures, replaces {} in the observation.
+    """
+    joints = tuple(map(int, np.flatnonzero(concerned)))
+    if not joints:
+        return []
+    *others, last = (str(joint + 1) for joint in joints)
+    names = f"joints {', '.join(others)} and {last}" if others else f"joint {last}"
+    return [Finding(severity, check, observation.replace("{}", names, 1), remedy, joints)]
 
 
 def check_times(data: Trajectories) -> list[Finding]:
     """Checks rate, jitter, gaps and the number of trajectories for a split."""
+    findings = []
     counts = np.unique(data.trajectory, return_counts=True)[1]
-    few = f"the number of trajectories is {len(counts)}; a split by trajectory needs {LEAST_TRAJECTORIES}"
-    split = Finding("warning", "split", few, "record more, or cut the log in time and number the parts")
-    cases = [(len(counts) < LEAST_TRAJECTORIES, split)]
-    if counts.max() > 1:
-        rate, jitter, gaps, longest, rates = timing(data.t, data.trajectory)
-        step = f"{1 / rate:.3g} s"
+    if len(counts) < LEAST_TRAJECTORIES:
+        few = f"the number of trajectories is {len(counts)}; a split by trajectory needs {LEAST_TRAJECTORIES}"
+        findings.append(Finding("warning", "split", few, "record more, or cut the log in time and number the parts"))
+    if counts.max() == 1:
+        return findings
+    rate, jitter, gaps, longest, rates = timing(data.t, data.trajectory)
+    step = f"{1 / rate:.3g} s"
+    if rate < SLOWEST:
+        remedy = "give t in seconds if it is in milliseconds or ticks"
+        findings.append(Finding("error", "time-unit", f"samples are {step} apart", remedy))
+    if gaps:
         gapped = f"t has {gaps} gap(s): the longest step is {longest:.3g} s, the typical one {step}"
+        remedy = "cut the log at gaps, as smooth() does; rates across them are guesses"
+        findings.append(Finding("note", "gaps", gapped, remedy))
+    if jitter > JITTER:
+        findings.append(Finding("warning", "jitter", f"time steps vary by {jitter:.0%}", FILTER))
+    if np.ptp(rates) > UNEQUAL * rate:
         unequal = f"trajectories are sampled at {rates.min():.4g} to {rates.max():.4g} Hz"
-        in_seconds = "give t in seconds if it is in milliseconds or ticks"
-        cut = "cut the log at gaps, as smooth() does; rates across them are guesses"
-        cases += [
-            (rate < SLOWEST, Finding("error", "time-unit", f"samples are {step} apart", in_seconds)),
-            (gaps > 0, Finding("note", "gaps", gapped, cut)),
-            (jitter > JITTER, Finding("warning", "jitter", f"time steps vary by {jitter:.0%}", FILTER)),
-            (np.ptp(rates) > UNEQUAL * rate, Finding("note", "rates", unequal, FILTER)),
-        ]
-    return [finding for holds, finding in cases if holds]
+        findings.append(Finding("note", "rates", unequal, FILTER))
+    return findings
 
 
 def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding]:
@@ -64,25 +121,22 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
     weak = (speed < WEAK * np.median(speed)) & ~still
     steps = step_of(data.q)
     findings = on_joints(
-        "warning", "unexcited", still, f"{{}} never {'moves' if still.sum() == 1 else 'move'}",
+        "warning", "unexcited", still, "the position of {} is constant",
         "move it in some trajectories, or leave it out of q: its inertia and friction cannot be learned",
     )  # fmt: skip
     findings += on_joints(
-        "warning", "unexcited", weak,
-        f"{{}} {'moves' if weak.sum() == 1 else 'move'} less than {WEAK:.0%} as fast as others",
+        "warning", "unexcited", weak, f"the speed of {{}} is less than {WEAK:.0%} of that of other joints",
         "excite it more: the log hardly shows its dynamics",
     )  # fmt: skip
     if "tau" not in data.estimated:
         # A joint without a motor has zero torque; a passive system has only such joints.
         constant = (np.ptp(data.tau, axis=0) == 0) & (data.tau[0] != 0)
-        needs = data.needs
         driven = np.ones(len(still), bool)
-        if needs is not None and needs.actuation is not None:
-            driven = np.any(np.asarray(needs.actuation) != 0, axis=1)
+        if data.needs is not None and data.needs.actuation is not None:
+            driven = np.any(np.asarray(data.needs.actuation) != 0, axis=1)
         dead = driven & ~data.tau.any(axis=0) & ~still
         findings += on_joints(
-            "warning", "dead-torque", dead,
-            f"the torque of {{}} is zero in all samples, although {'it moves' if dead.sum() == 1 else 'they move'}",
+            "warning", "dead-torque", dead, "the torque of {} is zero in all samples, although the position changes",
             "log that torque; or state in needs, by actuation, that the joint has no motor",
         )  # fmt: skip
         fast = np.abs(data.qd) > FAST * np.sqrt(np.mean(data.qd**2, axis=0))
@@ -90,8 +144,7 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
         hidden = driven & (zero > HIDDEN) & ~dead & ~still
         findings += on_joints(
             "warning", "hidden-torque", hidden,
-            f"the torque of {{}} is exactly zero in up to {zero[hidden].max(initial=0.0):.0%} of the samples in which "
-            f"{'it moves' if hidden.sum() == 1 else 'they move'}",
+            f"the torque of {{}} is exactly zero in up to {zero[hidden].max(initial=0.0):.0%} of the moving samples",
             "unless the motors were off, the drivers hide small torques: leave such joints out (--lock)",
         )  # fmt: skip
         findings += on_joints(
@@ -99,27 +152,24 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
             "check that the right channel was logged",
         )  # fmt: skip
         findings += _saturated(data, "tau", "torque", "avoid the limits of the motors, or leave those samples out")
-    findings += _spiky(data, "q", "position", "leave those samples out")
-    findings += _spiky(data, "tau", "torque", "leave those samples out, or let identify weigh them by --robust")
+    for key, word, remedy in (
+        ("q", "position", "leave those samples out"),
+        ("tau", "torque", "leave those samples out, or let identify weigh them by --robust"),
+    ):
+        if key not in data.estimated:
+            counts = _spikes(getattr(data, key), data.trajectory).sum(axis=0)
+            observation = f"the {word} of {{}} has {int(counts.sum())} spike(s)"
+            findings += on_joints("warning", "spikes", counts > 0, observation, remedy)
     findings += _saturated(
         data, "q", "position", "check whether it is at its stop or the log is clipped; leave those samples out"
     )
-    findings += on_joints(
+    return findings + on_joints(
         "note", "quantisation", steps > COARSE, f"q of {{}} comes in steps of up to {steps.max():.2g}",
         "filter before rates are derived: --cutoff auto, or smooth()",
     )  # fmt: skip
-    return findings
 
 
-def _spiky(data: Trajectories, key: str, word: str, remedy: str) -> list[Finding]:
-    """Reports single samples far from both neighbours, which agree with each other."""
-    if key in data.estimated:
-        return []
-    counts = spikes(getattr(data, key), data.trajectory).sum(axis=0)
-    return on_joints("warning", "spikes", counts > 0, f"the {word} of {{}} has {int(counts.sum())} spike(s)", remedy)
-
-
-def spikes(values: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
+def _spikes(values: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
     """Mask of samples [N, k] that leave a channel and return at once, by much more than it ever changes otherwise.
 
     A sample is compared with the median of the two neighbours on either side. Upper quartiles of that error and of the
@@ -166,3 +216,109 @@ def flat_share(channel: np.ndarray, trajectory: np.ndarray) -> float:
             if last - first >= RUN and any(moves[place] > abrupt for place in beside):
                 count += last - first
     return count / len(channel)
+
+
+def _match(
+    measured: Float[np.ndarray, "N d"], derived: Float[np.ndarray, "N d"], part: Int[np.ndarray, " N"], farthest: int
+) -> tuple[Float[np.ndarray, " d"], ...]:
+    """Least-squares match of two signals in every channel, measured(t) = factor * derived(t - delay).
+
+    Returns the factors, the delays in samples, the correlations, and the squared error without delay divided by that
+    at the delay.
+    """
+    shifts, columns = np.arange(-farthest, farthest + 1), np.arange(measured.shape[1])
+    inside = away_from_ends(part, farthest)
+    if len(inside) < 16:
+        one, zero = np.ones(len(columns)), np.zeros(len(columns))
+        return one, zero, zero, one
+    x = derived[inside]
+    along = np.array([np.sum(measured[inside + shift] * x, axis=0) for shift in shifts])
+    sizes = np.array([np.sum(measured[inside + shift] ** 2, axis=0) for shift in shifts])
+    size = np.maximum(np.sum(x**2, axis=0), TINY)
+    relative = (sizes - along**2 / size) / np.maximum(sizes, TINY)
+    best = np.argmin(relative, axis=0)
+    lowest, along = relative[best, columns], along[best, columns]
+    offset = np.array([vertex(errors, place) for errors, place in zip(relative.T, best, strict=True)])
+    correlation = np.sqrt(np.maximum(0.0, 1 - lowest)) * np.sign(along)
+    gained = relative[farthest] / np.maximum(lowest, np.finfo(float).eps)
+    return along / size, shifts[best] + offset, correlation, gained
+
+
+def vertex(values: np.ndarray, lowest: int | np.integer) -> float:
+    """Offset of the minimum of the parabola through the lowest value and its neighbours, in steps."""
+    if not 0 < lowest < len(values) - 1:
+        return 0.0
+    before, here, after = values[lowest - 1 : lowest + 2]
+    curvature = before - 2 * here + after
+    return float(0.5 * (before - after) / curvature) if curvature > 0 else 0.0
+
+
+def away_from_ends(part: Int[np.ndarray, " N"], farthest: int) -> Int[np.ndarray, " n"]:
+    """Indices of samples with `farthest` neighbours of the same part on either side."""
+    places = np.arange(farthest, len(part) - farthest)
+    return places[(part[places - farthest] == part[places]) & (part[places + farthest] == part[places])]
+
+
+def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
+    """Checks that qd is the rate of q, and qdd the rate of qd, if the file has them; `even` is smooth(data, trim=0)."""
+    findings = []
+    part, moves = even.data.trajectory, data.q.std(axis=0) > 0
+    derived = {"qd": (even.data.qd, "dq/dt"), "qdd": (even.data.qdd, "d²q/dt²")}
+    for key, (own, formula), (other, name) in (
+        ("qd", derived["qd"], derived["qdd"]), ("qdd", derived["qdd"], derived["qd"])
+    ):  # fmt: skip
+        if key in data.estimated:
+            continue
+        measured = _at_times_of(data, even, getattr(data, key))
+        inside = away_from_ends(part, 2)
+        left, left_other = (
+            1 - np.sum(x * measured[inside], axis=0) ** 2
+            / np.maximum(np.sum(x**2, axis=0) * np.sum(measured[inside] ** 2, axis=0), TINY)
+            for x in (own[inside], other[inside])
+        )  # fmt: skip
+        if moves.any() and ((left_other < 1 - ALIKE**2) & (left_other < EXCHANGED * left))[moves].all():
+            observation = f"{key} is {name}, not {formula}"
+            findings.append(Finding("error", f"{key}-exchanged", observation, f"exchange qd and qdd, or {RATE_REMEDY}"))
+            continue
+        farthest = max(2, min(round(FARTHEST * even.rate), 40, len(measured) // 8))
+        factor, delay, correlation, gained = _match(measured, own, part, farthest)
+        alike = (np.abs(correlation) > ALIKE) & moves
+        # Noise of the derived signal lowers the least-squares factor, noise of the measured one does not: the true
+        # factor lies between the regressions of either signal on the other.
+        least = np.abs(factor)
+        most = least / np.maximum(correlation**2, TINY)
+        degrees, radians, milli, right = (
+            alike & (least < unit * tolerance) & (unit < most * tolerance)
+            for unit, tolerance in ((RADIAN, 1.05), (1 / RADIAN, 1.05), (1000.0, 1.05), (1.0, 1.15))
+        )
+        opposite = alike & (factor < 0)
+        odd = alike & ~(degrees | radians | milli | opposite | right)
+        late = alike & (np.abs(delay) > LATE) & (gained > 1.5)
+        worst = max(delay[late], key=abs, default=0.0)
+        delayed = f"up to {abs(worst) / even.rate * 1e3:.3g} ms {'late' if worst > 0 else 'early'}"
+        ratios = ", ".join(f"{number:.3g}" for number in factor[odd])
+        cases: tuple[tuple[Severity, str, np.ndarray, str, str], ...] = (
+            ("error", "unit", degrees, f"is 57.3 times {formula}", f"convert {key} from degrees to radians"),
+            ("error", "unit", radians, f"is {formula} / 57.3", "convert q from degrees to radians"),
+            ("error", "unit", milli, f"is 1000 times {formula}", "give t in seconds"),
+            ("error", "sign", opposite, f"has the opposite sign of {formula}", f"change the sign of {key} or q"),
+            ("error", "unit", odd, f"is {ratios} times {formula}", f"check units and gear ratios, or {RATE_REMEDY}"),
+            ("error", "unlike", (np.abs(correlation) < UNLIKE) & moves, f"does not follow {formula}",
+             f"check the order of the columns, or {RATE_REMEDY}"),
+            ("warning", "delay", late, f"is {delayed} relative to q", RATE_REMEDY),
+        )  # fmt: skip
+        for severity, kind, joints, observation, remedy in cases:
+            findings += on_joints(severity, f"{key}-{kind}", joints, f"{key} of {{}} {observation}", remedy)
+    return findings
+
+
+def _at_times_of(data: Trajectories, even: Smoothed, values: np.ndarray) -> np.ndarray:
+    """Columns of a log at the times of its smoothed samples, by linear interpolation."""
+    rows = np.empty((len(even.data.t), values.shape[1]))
+    sources = {str(label): index for index, label in enumerate(data.label)}
+    for index, label in enumerate(map(str, even.data.label)):
+        source = sources.get(label, sources.get(label.rpartition(PART)[0]))
+        here, there = even.data.trajectory == index, data.trajectory == source
+        for column in range(values.shape[1]):
+            rows[here, column] = np.interp(even.data.t[here], data.t[there], values[there, column])
+    return rows

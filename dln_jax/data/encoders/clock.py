@@ -43,13 +43,13 @@ class Clock(NamedTuple):
     jitter: float
     """Standard deviation of the stamps' steps about whole numbers of periods, in periods."""
 
-
-def clock_line(clock: Clock) -> str:
-    """Returns a line on the jitter of the stamps and the steps of the source."""
-    return (
-        f"t jitters by {clock.jitter:.0%} of a step, but by q and qd the rows are whole multiples of "
-        f"{1e3 * clock.period:.4g} ms apart"
-    )
+    @property
+    def line(self) -> str:
+        """Jitter of the stamps and steps of the source, in words."""
+        return (
+            f"t jitters by {self.jitter:.0%} of a step, but by q and qd the rows are whole multiples of "
+            f"{1e3 * self.period:.4g} ms apart"
+        )
 
 
 def source_clock(data: Trajectories, interpolated: Bool[np.ndarray, " N"] | None = None) -> Clock | None:

@@ -1,4 +1,4 @@
-"""A low-pass filter without delay, and derivatives of the filtered signal.
+"""A low-pass filter without delay, the choice of its cut-off frequency, and derivatives of the filtered signal.
 
 A Butterworth filter runs forwards and backwards (Gustafsson 1996), with the gain
 
@@ -13,12 +13,30 @@ which makes accelerations there 2 to 40 times more accurate; from 1.5 periods on
 
 Derivatives are those of the quintic spline through the filtered samples. A second derivative is exact to 0.02 % at a
 tenth of the rate and to 1.3 % at a quarter, where central differences taken twice lose 12 % and 60 %.
+
+The cut-off minimises the expected error of accelerations. The spectrum of a coordinate is the sum of that of its
+motion, S(f), and a white noise floor N. A filter of gain H removes the fraction 1 - H of the motion's acceleration and
+passes the fraction H of the noise's:
+
+    E(cutoff) = sum over joints of  integral (2 pi f)^4 [(1 - H)² S + H² N] df  /  integral (2 pi f)^4 S df
+
+For a steep filter the frequency weight does not affect the minimum, which lies where S = N for derivatives of any
+order: one cut-off serves q, qd and qdd. Spectra of second differences are averaged (Welch 1967) and divided by the gain
+of the differences, so that the motion does not leak into the floor.
+
+Spectra are means of squares, which a single jump can dominate; the noise is a median, which no jump changes. Jumps are
+therefore interpolated before spectra are taken. If the top of a spectrum is flat and above the median's floor, it is
+the floor. Noise need not be white: where the spectrum of accelerations rises up to the highest frequency, it is noise.
+A periodic motion has lines, and only noise in the gaps between them: neither rule ends a motion in a gap.
 """
+
+import math
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from dln_jax.data.encoders.sampling import by_trajectory
+from dln_jax.data.encoders.sampling import NORMAL, by_trajectory
 from dln_jax.types import InputError, require_positive
 
 ORDER = 4
@@ -27,6 +45,50 @@ PERIODS = 3
 """Length of the reflected extension at both ends of a segment, in periods of the cut-off."""
 END_PERIODS, END_DEGREE = 1.0, 5
 """Length in periods of the cut-off, and degree, of the polynomial from which values at an end are estimated."""
+SEGMENT = 8.0
+"""s: length of the segments over which spectra are averaged."""
+SEEN = 1.5
+"""A smoothed spectrum above this multiple of the floor belongs to the motion."""
+CANDIDATES = 200
+TOP = 0.45
+"""Highest cut-off tried, as a fraction of the sampling rate."""
+MOVES = 2.0
+"""A joint counts as moving if its standard deviation exceeds this multiple of its noise."""
+WORTH = 1e-4
+"""No filter is applied up to this relative error of unfiltered accelerations; above it there always is a cut-off."""
+JUMP = 8.0
+"""A jump differs from its neighbours' prediction by more than this many standard deviations."""
+RARE = 0.1
+"""Largest fraction of samples that can be jumps; more of them are a motion, or noise that is not white."""
+PREDICTION = math.sqrt(1 + 524 / 400)
+"""Standard deviation of the prediction error, in units of the noise."""
+MEDIAN = math.log(2)
+"""Ratio of median to mean of a spectrum's lines if few segments are averaged."""
+RISES = 3.0
+"""A spectrum of accelerations that exceeds its minimum by this factor at high frequencies is noise there."""
+GAP = 3.3
+"""Widest gap between the lines of a periodic motion, as a ratio of frequencies: odd harmonics begin with 1 and 3."""
+SHALLOW = 30.0
+"""A spectrum of accelerations has a shallow minimum if its peak is less than this multiple of it."""
+FLAT = 4.0
+"""Largest ratio between the thirds of the upper half of a spectrum for it to count as flat."""
+
+
+class Choice(NamedTuple):
+    """The cut-off, and the quantities it was chosen from (for plots)."""
+
+    cutoff: float
+    """Hz; infinite if the noise is too small for a filter."""
+    tried: Float[np.ndarray, " C"]
+    """Cut-offs tried, Hz."""
+    error: Float[np.ndarray, " C"]
+    """E of every cut-off: expected squared relative error of the accelerations, mean over joints."""
+    f: Float[np.ndarray, " F"]
+    """Hz."""
+    spectrum: Float[np.ndarray, "F d"]
+    """Spectrum of q, (rad or m)² / Hz."""
+    floor: Float[np.ndarray, " d"]
+    """White part of N, in the same unit."""
 
 
 def gain(f: Float[np.ndarray, " n"], cutoff: float) -> Float[np.ndarray, " n"]:
@@ -63,14 +125,14 @@ def low_pass(
     extension = int(np.ceil(PERIODS * rate / cutoff))
     filtered = []
     for part in [values] if trajectory is None else by_trajectory(values, trajectory):
-        slow = bent(part, int(np.ceil(END_PERIODS * rate / cutoff)))
+        slow = _between_ends(part, int(np.ceil(END_PERIODS * rate / cutoff)))
         rest = sosfiltfilt(sections, part - slow, axis=0, padlen=min(extension, len(part) - 1))
         filtered.append(slow + rest)
     return np.concatenate(filtered)
 
 
-def bent(values: Float[np.ndarray, "n k"], near: int) -> Float[np.ndarray, "n k"]:
-    """The quintic with the values' own value, slope and curvature at both ends, estimated from `near` samples.
+def _between_ends(values: np.ndarray, near: int) -> np.ndarray:
+    """The quintic with the own value, slope and curvature of values [n, k] at both ends, estimated from `near` samples.
 
     Without it the values are straight at their ends, where the filter extends them by reflection; it is slow enough to
     pass every filter. Zero for fewer samples than twice `near`.
@@ -102,3 +164,144 @@ def derivatives(
     t = np.arange(len(q)) / rate
     spline = make_interp_spline(t, q, k=5, axis=0)
     return spline(t, nu=1), spline(t, nu=2)
+
+
+def choose_cutoff(
+    q: Float[np.ndarray, "N d"], trajectory: Int[np.ndarray, " N"], *, rate: float, noise: Float[np.ndarray, " d"]
+) -> Choice:
+    """Finds the cut-off with the lowest expected error.
+
+    Args:
+        q: coordinates at equal steps.
+        rate: Hz.
+        noise: standard deviation of the noise of every coordinate.
+
+    Raises:
+        InputError: no segment has sixteen samples, or nothing moves by more than its noise.
+    """
+    require_positive(rate=rate)
+    f, spectrum = _spectra(_without_jumps(q, trajectory, noise), trajectory, rate=rate)
+    white = np.maximum(2 * noise**2 / rate, _flat_top(f, spectrum))
+    floor = np.maximum(white, _rising(f, spectrum, white))
+    # The motion's spectrum S ends where the mean spectrum falls to the floor and stays there for more than a gap.
+    seen = _mean(spectrum) >= SEEN * _mean(floor)
+    hidden = np.cumsum(~_highest(seen, 1.0, GAP), axis=0) > 0
+    signal = np.where(hidden, 0.0, np.maximum(spectrum - floor, 0.0))
+    tried = np.geomspace(max(f[0], rate / 500), TOP * rate, CANDIDATES)
+    weight = (2 * np.pi * f) ** 4
+    sizes = weight @ signal
+    moves = (sizes > 0) & (q.std(axis=0) > MOVES * noise)
+    if not moves.any():
+        raise InputError("no joint moves by more than its noise, so no cut-off can be chosen; give one, or check q")
+    error = np.empty(CANDIDATES)
+    for place, cutoff in enumerate(tried):
+        H = gain(f, float(cutoff))[:, None]
+        left = weight @ ((1 - H) ** 2 * signal + H**2 * floor)
+        error[place] = np.mean(left[moves] / sizes[moves])
+    best = int(np.argmin(error))
+    raw = np.mean((weight @ floor)[moves] / sizes[moves])
+    cutoff = float(tried[best]) if raw > WORTH**2 else np.inf
+    return Choice(cutoff, tried, error, f, spectrum, white)
+
+
+def _without_jumps(values: np.ndarray, trajectory: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Interpolates rare samples of channels [N, k] that neither noise [k] nor the motion explains.
+
+    A sample is compared with the prediction of the quintic through three samples on either side, (1, -6, 15, 15, -6, 1)
+    / 20. It is a jump if the error is many standard deviations both of the noise and of such errors elsewhere.
+    """
+    from scipy.interpolate import make_interp_spline
+    from scipy.ndimage import maximum_filter1d
+
+    inside = np.flatnonzero(trajectory[6:] == trajectory[:-6]) + 3
+    if not len(inside):
+        return values
+    sums = [values[inside - k] + values[inside + k] for k in (1, 2, 3)]
+    errors = np.zeros_like(values)
+    errors[inside] = np.abs(values[inside] - (15 * sums[0] - 6 * sums[1] + sums[2]) / 20)
+    usual = np.maximum(PREDICTION * noise, np.median(errors[inside], axis=0) / NORMAL)
+    # A jump also causes errors in neighbouring samples; only the largest error nearby counts.
+    wrong = (errors > JUMP * usual) & (errors == maximum_filter1d(errors, 7, axis=0))
+    values, places = values.copy(), np.arange(len(values))
+    for channel in np.flatnonzero(wrong.any(axis=0) & (wrong.mean(axis=0) < RARE)):
+        bad = wrong[:, channel]
+        values[bad, channel] = make_interp_spline(places[~bad], values[~bad, channel], k=5)(places[bad])
+    return values
+
+
+def _flat_top(f: np.ndarray, spectrum: np.ndarray) -> np.ndarray:
+    """Level [d] of the upper half of a spectrum [F, d] that is flat, as white noise is; zero otherwise."""
+    parts = [np.median(part, axis=0) for part in np.array_split(spectrum[f > f[-1] / 2], 3) if len(part)]
+    if len(parts) < 3:
+        return np.zeros(spectrum.shape[1])
+    levels = np.array(parts)
+    flat = levels.max(axis=0) < FLAT * levels.min(axis=0)
+    return np.where(flat, levels.min(axis=0) / MEDIAN, 0.0)
+
+
+def _rising(f: np.ndarray, spectrum: np.ndarray, white: np.ndarray) -> np.ndarray:
+    """Part of a spectrum [F, d] above the minimum of the acceleration power, if that rises up to half the rate; else 0.
+
+    Forces of finite power make accelerations with a falling spectrum, so a rising one is noise, white or not: timing
+    jitter of a fraction of a step, for example, is noise proportional to the velocity. Zero, too, if the minimum is
+    shallow and the white floor explains the highest frequencies: what lies between is motion, such as that of motors
+    that chatter.
+    """
+    logarithm = np.log(np.maximum(spectrum, np.finfo(float).tiny))
+    accelerations = f[:, None] ** 4 * np.exp(_mean(logarithm))  # geometric mean
+    envelopes = _highest(f[:, None] ** 4 * _mean(spectrum), math.sqrt(1 / GAP), math.sqrt(GAP))
+    rising = np.zeros_like(spectrum)
+    for channel, (power, envelope) in enumerate(zip(accelerations.T, envelopes.T, strict=True)):
+        peak = int(np.argmax(power[f < f[-1] / 4])) if (f < f[-1] / 4).any() else 0
+        lowest, of_envelope = (peak + int(np.argmin(values[peak:])) for values in (power, envelope))
+        if math.sqrt(GAP) * f[lowest] < f[of_envelope]:  # a gap
+            lowest = of_envelope
+        top = f > f[-1] / 2
+        explained = np.median(spectrum[top, channel]) < RISES * MEDIAN * white[channel]
+        shallow = power[peak] < SHALLOW * power[lowest]
+        if not (explained and shallow) and power[top].min() > RISES * power[lowest]:
+            rising[lowest:, channel] = spectrum[lowest:, channel]
+    return rising
+
+
+def _spectra(values: np.ndarray, trajectory: np.ndarray, *, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Positive frequencies [F], Hz, and power spectra [F, k] of channels [N, k], unit² / Hz, averaged over segments.
+
+    Raises:
+        InputError: no trajectory has sixteen samples.
+    """
+    from scipy.signal import welch
+
+    parts = [part for part in by_trajectory(values, trajectory) if len(part) >= 16]
+    if not parts:
+        raise InputError("no segment has the 16 samples of a spectrum; record longer motions, or give a cut-off")
+    length = min(max(len(part) for part in parts) - 2, max(14, round(SEGMENT * rate)))
+    total, weight = 0.0, 0
+    f = np.zeros(0)
+    for part in parts:
+        changes = np.diff(part, n=2, axis=0)
+        if len(changes) < length:
+            changes = np.concatenate([changes, np.zeros((length - len(changes), changes.shape[1]))])
+        f, power = welch(changes, fs=rate, nperseg=length, axis=0)
+        total, weight = total + len(part) * power * (length / min(length, len(part) - 2)), weight + len(part)
+    power = np.asarray(total)[1:] / weight
+    return f[1:], power / (2 * np.sin(np.pi * f[1:, None] / rate)) ** 4
+
+
+def _mean(spectrum: np.ndarray) -> np.ndarray:
+    """Mean of a spectrum [F, d] over a sixth of an octave on either side, which keeps lines."""
+    summed = np.concatenate([np.zeros((1, spectrum.shape[1])), np.cumsum(spectrum, axis=0)])
+    low, high = _window(len(spectrum), 2 ** (-1 / 6), 2 ** (1 / 6))
+    return (summed[high] - summed[low]) / (high - low)[:, None]
+
+
+def _highest(values: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Maximum over the frequencies from `low` to `high` times each one."""
+    return np.stack([values[a:b].max(axis=0) for a, b in zip(*_window(len(values), low, high), strict=True)])
+
+
+def _window(count: int, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
+    """First and last index + 1 of the frequencies from `low` to `high` times each one."""
+    place = np.arange(1, count + 1)
+    first = np.maximum(np.floor(place * low).astype(int) - 1, 0)
+    return first, np.minimum(np.ceil(place * high).astype(int), count)

@@ -1,6 +1,6 @@
 """Converts q, t and tau of a log to trajectories with derivatives.
 
-1. Repeated rows are removed (see `repeats`), and stamps of arrival are replaced by the source's times (see `clock`),
+1. Repeated rows are removed (see `sampling`), and stamps of arrival are replaced by the source's times (see `clock`),
    which is all that measured rates serve for. Long gaps cut a trajectory into parts named LABEL/1, LABEL/2 and so on,
    short ones are bridged; samples at unequal steps are interpolated to one rate.
 2. The noise of every channel is estimated. The noise and the spectra of q determine the cut-off, unless it is set.
@@ -11,22 +11,30 @@
 Torques are not filtered by default: least squares average out their noise, while filtered torques of a model with dry
 friction belong to no state, see `filters`. On a simulated seven-axis arm filtering them cost a factor of 1.6
 (`scripts.reports.robots.known_kinematics`).
+
+Short or unevenly sampled motions are smoothed by local polynomials. A polynomial in time is fitted by least squares to
+the neighbours of every sample, at any spacing (Savitzky and Golay 1964). The number of neighbours is chosen per
+coordinate by leave-one-out error, e_i / (1 - H_ii) (Allen 1974): few for a strongly curved motion, many for a noisy
+one. This assumes independent noise.
+
+The low-pass filter of `smooth` is for long logs: it needs equal steps and four periods of its cut-off, and is less
+accurate near the ends. On eight segments of 61 samples its velocities had two to five times the error of these, and its
+noise was a quarter too small if steps varied by 30 %.
 """
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from dln_jax.data.arrays import spread
 from dln_jax.data.encoders import sampling
 from dln_jax.data.encoders.clock import Clock, source_clock
-from dln_jax.data.encoders.cutoff import Choice, choose_cutoff
-from dln_jax.data.encoders.filters import derivatives, low_pass
-from dln_jax.data.encoders.repeats import Repeats, interpolated, without_repeats
-from dln_jax.data.encoders.sampling import noise_of
+from dln_jax.data.encoders.filters import Choice, choose_cutoff, derivatives, low_pass
+from dln_jax.data.encoders.sampling import Repeats, interpolate, noise_of, without_repeats
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import segments
+from dln_jax.data.splits import segments, select_samples
 from dln_jax.types import InputError, require_positive
 
 SHORT = 0.01
@@ -38,6 +46,13 @@ TRIMMED = 1.5
 """Trimmed length in periods of the cut-off; beyond it accelerations are as accurate as in the middle."""
 PART = "/"
 """Separator between a trajectory's label and the number of its part."""
+DEGREE = 4
+"""Degree of the polynomials: high enough for the acceleration itself to have slope and curvature."""
+FEWEST = DEGREE + 2
+"""Samples of the shortest segment."""
+GROWTH = 1.3
+"""Ratio of successive numbers of neighbours tried."""
+MOST_POINTS = 401
 
 
 class Smoothed(NamedTuple):
@@ -59,10 +74,8 @@ class Smoothed(NamedTuple):
     decimate: int
     trim: float
     """Time trimmed at both ends of every part, s."""
-    bridged: int
-    """Number of interpolated gaps."""
     parts: int
-    """Number of trajectories after cuts at longer gaps."""
+    """Number of trajectories after cuts at gaps that are not bridged."""
     left_out: int
     """Number of segments that were too short."""
     repeats: Repeats
@@ -75,7 +88,6 @@ def smooth(
     data: Trajectories,
     cutoff: float | None = None,
     *,
-    rate: float | None = None,
     filter_torque: bool | None = None,
     decimate: int = 1,
     trim: float | None = None,
@@ -83,8 +95,7 @@ def smooth(
     """Estimates derivatives and smooths a log's q, t and tau for learning; existing rates only correct stamps.
 
     Args:
-        cutoff: Hz, infinite for none (default: chosen from the data, see `cutoff`).
-        rate: rate of the equal steps, Hz (default: the median of the data).
+        cutoff: Hz, infinite for none (default: chosen from the data, see `filters`).
         filter_torque: whether to filter tau as well (default: only if samples are dropped).
         decimate: keep every `decimate`-th sample.
         trim: time cut off at both ends of every part, s (default: 1.5 periods of the cut-off).
@@ -99,16 +110,13 @@ def smooth(
     of_q = (repeats.q & ~repeats.rows)[~repeats.rows]
     clock = source_clock(data, of_q)
     if clock is not None:
-        data = data._replace(t=clock.t, q=interpolated(clock.t, data.q, data.trajectory, of_q))
-    if rate is None:
-        # Rounding removes the rounding errors of time differences.
-        rate = float(f"{sampling.timing(data.t, data.trajectory).rate:.9g}")
-    require_positive(rate=rate)
+        data = data._replace(t=clock.t, q=interpolate(clock.t, data.q, data.trajectory, of_q))
+    rate = sampling.typical_rate(data)
     d, values = data.degrees_of_freedom, np.hstack([data.q, data.tau])
     pieces = segments(data.t, data.trajectory, gap=max(sampling.BRIDGED, SHORT * rate))
     even = [sampling.even(data.t[piece], values[piece], rate) for piece in pieces]
     values, part = np.concatenate([x for _, x in even]), np.repeat(np.arange(len(even)), [len(t) for t, _ in even])
-    noise_q, noise_tau = (noise_of(channels, part) for channels in (values[:, :d], values[:, d:]))
+    noise_q, noise_tau = np.split(noise_of(values, part), [d])
     choice = None
     if cutoff is None:
         choice = choose_cutoff(values[:, :d], part, rate=rate, noise=noise_q)
@@ -123,59 +131,103 @@ def smooth(
     trim = (0.0 if np.isinf(cutoff) else TRIMMED / cutoff) if trim is None else trim
     ends = round(trim * rate)
     shortest = max(6, round(SHORTEST * rate / cutoff) + 1, 2 * ends + 2 * decimate)
-    kept = [index for index, (t, _) in enumerate(even) if len(t) >= shortest]
-    if not kept:
+    long = [(piece, t, x) for piece, (t, x) in zip(pieces, even, strict=True) if len(t) >= shortest]
+    if not long:
         raise InputError(
             f"no segment without a gap has {shortest} samples, four periods of the cut-off at {rate:g} Hz; record "
             "longer motions, or give a higher cut-off"
         )
-    slow = data.temperature
-    columns: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "q", "qd", "qdd", "tau")}
-    temperatures: list[np.ndarray] = []
-    for index in kept:
-        t, x = even[index]
-        if slow is not None:
-            known = pieces[index]
-            of_joints = [np.interp(t, data.t[known], column) for column in slow[known].T]
-            temperatures.append(np.stack(of_joints, axis=1)[ends : len(t) - ends : decimate])
-        arrays = t, *_filtered(x[:, :d], x[:, d:], rate, cutoff, filter_torque=filtered)
-        for key, array in zip(columns, arrays, strict=True):
-            columns[key].append(array[ends : len(t) - ends : decimate])
+    columns: dict[str, list[np.ndarray]] = {}
+    for piece, t, x in long:
+        q = low_pass(x[:, :d], rate=rate, cutoff=cutoff)
+        qd, qdd = derivatives(q, rate=rate)
+        tau = low_pass(x[:, d:], rate=rate, cutoff=cutoff) if filtered else x[:, d:]
+        arrays = {"t": t, "q": q, "qd": qd, "qdd": qdd, "tau": tau}
+        if data.temperature is not None:
+            slow = [np.interp(t, data.t[piece], column) for column in data.temperature[piece].T]
+            arrays["temperature"] = np.stack(slow, axis=1)
+        for key, array in arrays.items():
+            columns.setdefault(key, []).append(array[ends : len(t) - ends : decimate])
+    absent = dict.fromkeys(("p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity"))
     smoothed = data._replace(
+        **absent,
         **{key: np.concatenate(parts) for key, parts in columns.items()},
-        trajectory=np.repeat(np.arange(len(kept)), [len(t) for t in columns["t"]]),
-        label=_labels(data, [int(data.trajectory[pieces[index][0]]) for index in kept]),
-        **dict.fromkeys(("p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")),
-        temperature=None if slow is None else np.concatenate(temperatures),
+        trajectory=np.repeat(np.arange(len(long)), [len(t) for t in columns["t"]]),
+        label=_labels(data, [int(data.trajectory[piece[0]]) for piece, _, _ in long]),
         estimated=tuple(key for key in data.estimated if key == "tau"),
     )
     share = np.sqrt(min(1.0, 2 * cutoff / rate)) if filtered else 1.0
     return Smoothed(
-        smoothed, cutoff, rate, noise_q, noise_tau * share, choice, filtered, decimate, trim,
-        bridged=len(segments(data.t, data.trajectory)) - len(pieces), parts=len(kept),
-        left_out=len(pieces) - len(kept), repeats=repeats, clock=clock,
+        smoothed, cutoff, rate, noise_q, noise_tau * share, choice, filtered, decimate, trim, len(long),
+        left_out=len(pieces) - len(long), repeats=repeats, clock=clock,
     )  # fmt: skip
-
-
-def _filtered(
-    q: np.ndarray, tau: np.ndarray, rate: float, cutoff: float, *, filter_torque: bool
-) -> tuple[np.ndarray, ...]:
-    q = low_pass(q, rate=rate, cutoff=cutoff)
-    return q, *derivatives(q, rate=rate), low_pass(tau, rate=rate, cutoff=cutoff) if filter_torque else tau
 
 
 def _labels(data: Trajectories, sources: list[int]) -> np.ndarray:
     """Labels of parts by the trajectories that they come from; parts of one trajectory are numbered from 1."""
-    counts = [sources[: place + 1].count(source) for place, source in enumerate(sources)]
-    return np.array(
-        [
-            str(data.label[source]) + (f"{PART}{count}" if sources.count(source) > 1 else "")
-            for source, count in zip(sources, counts, strict=True)
-        ]
-    )
+    labels = []
+    for place, source in enumerate(sources):
+        number = f"{PART}{sources[: place + 1].count(source)}" if sources.count(source) > 1 else ""
+        labels.append(f"{data.label[source]}{number}")
+    return np.array(labels)
 
 
 def labels_of_parts(data: Trajectories, labels: Sequence[str]) -> list[str]:
     """Labels after smoothing: the label of a trajectory that was cut becomes those of its parts; others stay."""
     parts = {label: [part for part in data.label if part.rpartition(PART)[0] == label] for label in labels}
     return [part for label in labels for part in ([label] if label in data.label else parts[label] or [label])]
+
+
+class LocalRates(NamedTuple):
+    """Trajectories with q, qd and qdd from local polynomials; all else is unchanged."""
+
+    data: Trajectories
+    noise: Float[np.ndarray, " d"]
+    """Standard deviation of the noise of q, rad or m."""
+    resolved: Bool[np.ndarray, " d"]
+    """Whether more than the fewest neighbours were best; if not, the noise may be the curvature of a coarse motion."""
+    rows: np.ndarray
+    """Rows of the samples kept."""
+
+
+def smooth_locally(data: Trajectories) -> LocalRates:
+    """Smooths coordinates and estimates their rates from q and t; segments shorter than `FEWEST` are left out.
+
+    Raises:
+        InputError: no segment is long enough.
+    """
+    spread("q", data.q)
+    parts = [part for part in segments(data.t, data.trajectory) if len(part) >= FEWEST]
+    if not parts:
+        raise InputError(f"no segment without a gap has {FEWEST} samples; record longer motions")
+    sizes = [FEWEST + (FEWEST % 2 == 0)]  # odd numbers, which centre the window on its sample
+    most = min(MOST_POINTS, *map(len, parts))
+    while (longer := 2 * int(np.ceil((GROWTH * sizes[-1] - 1) / 2)) + 1) <= most:
+        sizes.append(longer)
+    fits = [
+        np.concatenate([_polynomials(data.t[part], data.q[part], min(size, most)) for part in parts], axis=1)
+        for size in sizes
+    ]
+    best = np.argmin([np.mean(left_out**2, axis=0) for _, _, _, left_out, _ in fits], axis=0)
+    chosen = np.stack([fits[size][..., joint] for joint, size in enumerate(best)], axis=2)
+    q, qd, qdd, _, variance = chosen
+    rows = np.concatenate(parts)
+    smoothed = select_samples(data, rows)._replace(q=q, qd=qd, qdd=qdd)
+    return LocalRates(smoothed, np.sqrt(np.mean(variance, axis=0)), best > 0, rows)
+
+
+def _polynomials(t: np.ndarray, q: np.ndarray, size: int) -> Float[np.ndarray, "5 n d"]:
+    """q, qd, qdd, leave-one-out errors and variances of the noise of one segment, from `size` neighbours each.
+
+    Near the ends fewer of them are on one side.
+    """
+    first = np.clip(np.arange(len(t)) - size // 2, 0, len(t) - size)
+    around = first[:, None] + np.arange(size)
+    unit = 0.5 * (t[-1] - t[0]) * size / len(t)
+    powers = ((t[around] - t[:, None]) / unit)[..., None] ** np.arange(DEGREE + 1)
+    # The normal equations are safe here: the matrices are small and times are scaled.
+    inverse = np.linalg.solve(powers.transpose(0, 2, 1) @ powers, powers.transpose(0, 2, 1))
+    value, slope, bend = (np.einsum("ns,nsd->nd", inverse[:, order], q[around]) for order in range(3))
+    own = 1 - inverse[np.arange(len(t)), 0, np.arange(len(t)) - first][:, None]
+    residual = q - value
+    return np.array([value, slope / unit, 2 * bend / unit**2, residual / own, residual**2 / own])

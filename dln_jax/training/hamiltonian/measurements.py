@@ -13,9 +13,9 @@ import numpy as np
 from dln_jax.data import schema
 from dln_jax.data.arrays import spread
 from dln_jax.data.bodies import find_bodies
-from dln_jax.data.encoders.local_polynomials import SHORTEST, smooth_locally
+from dln_jax.data.encoders.smoothing import FEWEST, smooth_locally
 from dln_jax.data.repeated_motions import motion_numbers
-from dln_jax.data.schema import Trajectories, column
+from dln_jax.data.schema import Trajectories, column, time_derivative
 from dln_jax.data.splits import (
     by_motion,
     label_indices,
@@ -26,7 +26,6 @@ from dln_jax.data.splits import (
     with_joints,
 )
 from dln_jax.data.stated_tests import stated_test
-from dln_jax.data.trajectory_times import time_derivative
 from dln_jax.learning.measured_motions import MeasuredWindows, Noise
 from dln_jax.learning.motions import Weights
 from dln_jax.metrics.measured_predictions import cut_recordings, grid_places
@@ -165,10 +164,10 @@ def trust_of(data: Trajectories, noise: tuple[float, ...] | None) -> Trust | Non
         more = f", or {2 * d} of q and then p" if own else ""
         raise InputError(f"noise has {len(noise)} numbers; expected one, or one for each of {d} coordinates{more}")
     parts = segments(data.t, data.trajectory)
-    if max(map(len, parts)) < SHORTEST:
+    if max(map(len, parts)) < FEWEST:
         if noise is None:
             return None
-        raise InputError(f"--noise is for motions, but no segment without a gap has {SHORTEST} samples; leave it out")
+        raise InputError(f"--noise is for motions, but no segment without a gap has {FEWEST} samples; leave it out")
     order = np.random.default_rng(0).permutation(len(parts))
     count = int(np.searchsorted(np.cumsum([len(parts[index]) for index in order]), SURVEYED)) + 1
     surveyed = select_samples(data, np.concatenate([parts[index] for index in sorted(order[:count])]))

@@ -11,12 +11,10 @@ from motions import sums_of_sines
 
 from dln_jax import Robot
 from dln_jax.commands import train_delan
-from dln_jax.data.checks.channels import flat_share
-from dln_jax.data.checks.derivatives import check_derivatives
-from dln_jax.data.checks.energies import STRONGEST, WEAKEST, covariances
-from dln_jax.data.checks.evidence import Explanation
-from dln_jax.data.checks.hypotheses import decisive
-from dln_jax.data.checks.validation import as_recording, examine, quick, read, report
+from dln_jax.data.checks.channels import check_derivatives, flat_share
+from dln_jax.data.checks.priors import STRONGEST, WEAKEST, Explanation, covariances
+from dln_jax.data.checks.report import examine, quick, read, report
+from dln_jax.data.checks.torques import decisive
 from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics.trees.description import dh_frames, serial
@@ -156,7 +154,7 @@ FAULTS = {
     "torques late": (lambda a: {"tau": late(a["tau"], 8)}, "delay", (), "late"),
     "torques cut off": (lambda a: {"tau": np.clip(a["tau"], -6, 6)}, "saturation-tau", None, "cut off"),
     "q cut off": (of_joint("q", 2, lambda x: np.minimum(x, 0.6 * x.max())), "saturation-q", (2,), "flat"),
-    "still": (of_joint("q", 2, np.ones_like), "unexcited", (2,), "never moves"),
+    "still": (of_joint("q", 2, np.ones_like), "unexcited", (2,), "is constant"),
     "hardly moved": (of_joint("q", 2, lambda x: 0.001 * x), "unexcited", (2,), "less than"),
     "steps": (
         lambda a: {"q": np.round(a["q"] / 2e-3) * 2e-3, **SILENT}, "quantisation", (0, 1, 2), "up to 0.002"
@@ -203,13 +201,13 @@ def test_a_planted_fault_is_found(clean, name):
 
 
 def test_a_clean_log_suits_its_robot(clean):
-    examined = examine(as_recording(from_arrays(clean)), arm())
+    examined = examine(from_arrays(clean), arm())
     on_tree = examined.on_tree
     assert examined.findings == [] and "nothing was found" in report(examined, "log.npz")
     assert on_tree.scale == pytest.approx(np.ones(3), rel=0.1)
     assert on_tree.gravity == pytest.approx([0, 0, -9.81], abs=0.3)
-    assert abs(on_tree.torques.likely_delay) < 0.2
-    assert on_tree.torques.coulomb == pytest.approx([0.8, 0.8, 0.15], rel=0.15)
+    assert abs(examined.torques.likely_delay) < 0.2
+    assert examined.torques.coulomb == pytest.approx([0.8, 0.8, 0.15], rel=0.15)
     assert 0 < on_tree.rank < on_tree.parameters and 1 < on_tree.condition < 1000
 
 
@@ -221,22 +219,22 @@ def test_rough_masses_of_a_file_are_no_fault_of_the_log(clean):
 
 def test_a_tilt_and_a_wrong_clock_are_found_with_the_robot(clean):
     tilted = arm(gravity=(9.81 * np.sin(0.3), 0.0, -9.81 * np.cos(0.3)))
-    (finding,) = examine(as_recording(from_arrays(clean)), tilted).on_tree.findings
+    (finding,) = examine(from_arrays(clean), tilted).on_tree.findings
     assert finding.check == "gravity" and "17 degrees" in finding.observation
-    examined = examine(as_recording(spoiled(clean, lambda a: {"t": 1.25 * a["t"], **RATELESS})), arm())
+    examined = examine(spoiled(clean, lambda a: {"t": 1.25 * a["t"], **RATELESS}), arm())
     # A filter settles no error of the clock.
     errors = {finding.check for finding in examined.findings if finding.severity == "error"}
     assert errors == {"clock"} and not errors & {*FILTERED} and "arrival" in FILTERED
-    assert examined.on_tree.torques.log.speed == pytest.approx(1.25, rel=0.03)
+    assert examined.torques.repaired.log.speed == pytest.approx(1.25, rel=0.03)
 
 
 def test_times_out_of_order_or_double_are_repaired_and_said(clean, tmp_path):
     order = np.random.default_rng(0).permutation(len(clean["t"]))
     arrays = {key: x if key == "needs" else x[np.r_[order, order[:5]]] for key, x in clean.items()}
     np.savez(tmp_path / "log.npz", **arrays, joint_names=np.array(["elbow", "base", "shoulder"]))
-    recording = read(tmp_path / "log.npz")
-    assert np.array_equal(recording.data.q, clean["q"]) and recording.data.needs.friction
-    found = {finding.check for finding in examine(recording, arm()).findings}
+    data, repaired = read(tmp_path / "log.npz")
+    assert np.array_equal(data.q, clean["q"]) and data.needs.friction
+    found = {finding.check for finding in examine(data, arm(), repaired=repaired).findings}
     assert {"time-order", "time-double", "order"} <= found
 
 
@@ -260,10 +258,10 @@ def test_an_exact_log_of_a_planar_arm_has_no_false_sign_or_delay():
     q, qd, qdd = (x[0] for x in states)
     tau = inverse_dynamics(planar(UPRIGHT, (2.0, 1.0, 0.5)).tree, q, qd, qdd) + 0.2 * qd
     data = from_arrays({"t": t, "q": q, "tau": tau, "trajectory": np.zeros(SAMPLES, int)})
-    examined = examine(as_recording(data))
+    examined = examine(data)
     assert [finding.check for finding in examined.findings if finding.severity != "note"] == ["split"]
-    assert abs(examined.regression.likely_delay) < 0.05
-    assert examined.regression.viscous == pytest.approx(np.full(3, 0.2), abs=0.02)
+    assert abs(examined.torques.likely_delay) < 0.05
+    assert examined.torques.viscous == pytest.approx(np.full(3, 0.2), abs=0.02)
 
 
 def test_covariance_of_torques_is_that_of_an_energy():
@@ -286,10 +284,10 @@ def test_covariance_of_torques_is_that_of_an_energy():
         of_state = lambda *other: torque(lambda *state: energy(*state, *other), *states[:, 0])  # noqa: E731
         return jax.jit(lambda: torque(of_state, *others[:, 1]))()
 
-    found = covariances(tuple(states), tuple(others), ("revolute", "prismatic"), sizes)[0]
+    kinetic, potential = covariances(tuple(states), tuple(others), ("revolute", "prismatic"), sizes)[0]
     for closed, energy in (
-        (found.kinetic, lambda q, u, p, v: kernel(q, p, 2) * (u * sizes @ v) ** 2),
-        (found.potential, lambda q, u, p, v: kernel(q, p, 1)),
+        (kinetic, lambda q, u, p, v: kernel(q, p, 2) * (u * sizes @ v) ** 2),
+        (potential, lambda q, u, p, v: kernel(q, p, 1)),
     ):
         assert closed[:2, 2:] == pytest.approx(np.asarray(covariance(energy)), abs=1e-12)
 
@@ -299,8 +297,8 @@ def test_a_repair_is_judged_by_the_joints_that_it_concerns():
     before = np.full((10, 7), 0.6)
     after = before.copy()
     after[:, 3] = 0.3
-    now = Explanation(None, None, None, np.zeros(10), before)
-    other = Explanation(None, None, None, np.full(10, 4.0), after)
+    now = Explanation(*5 * [None], np.zeros(10), before)
+    other = Explanation(*5 * [None], np.full(10, 4.0), after)
     assert decisive(now, other, 0.8, np.arange(7) == 3)
     assert not decisive(now, other, 0.8, np.arange(7) == 2) and not decisive(now, other, 0.8, np.ones(7, bool))
 
@@ -308,7 +306,7 @@ def test_a_repair_is_judged_by_the_joints_that_it_concerns():
 def test_logs_that_cannot_be_examined_are_refused(clean, tmp_path):
     two = spoiled(clean, lambda a: {"needs": None, **{key: a[key][:, :2] for key in ("q", "qd", "tau")}})
     with one_line("the robot has 3 joints, but the data have 2"):
-        examine(as_recording(two), arm())
+        examine(two, arm())
     np.savez(tmp_path / "empty.npz", t=np.zeros(3))
     with one_line("key 'q' is missing"):
         read(tmp_path / "empty.npz")

@@ -5,7 +5,7 @@ from calls import one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.data import schema
-from dln_jax.data.encoders.local_polynomials import smooth_locally
+from dln_jax.data.encoders.smoothing import smooth_locally
 
 NOISE = np.array([1e-3, 1e-2])
 

@@ -7,8 +7,14 @@ from motions import sums_of_sines
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.data.encoders.filters import derivatives, gain, low_pass
-from dln_jax.data.encoders.repeats import find_repeats, without_repeats
-from dln_jax.data.encoders.sampling import held_at_equal_steps, noise_of, step_of, torque_noise
+from dln_jax.data.encoders.sampling import (
+    find_repeats,
+    held_at_equal_steps,
+    noise_of,
+    step_of,
+    torque_noise,
+    without_repeats,
+)  # fmt: skip
 from dln_jax.data.encoders.smoothing import labels_of_parts, smooth
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import every
@@ -192,7 +198,7 @@ def test_long_gaps_cut_and_short_ones_are_bridged():
     arrays, _, _ = log()
     kept = np.delete(np.arange(len(arrays["t"])), np.r_[200:202, 1750:1950])  # two samples of run0, 1.6 s of run1
     smoothed = smooth(from_arrays({key: x if key == "label" else x[kept] for key, x in arrays.items()}), 8.0)
-    assert (smoothed.bridged, smoothed.parts, smoothed.left_out) == (1, 4, 0)
+    assert (smoothed.parts, smoothed.left_out) == (4, 0)
     assert list(smoothed.data.label) == ["run0", "run1/1", "run1/2", "run2"]
     assert labels_of_parts(smoothed.data, ["run1", "run2", "other"]) == ["run1/1", "run1/2", "run2", "other"]
     steps = np.diff(smoothed.data.t)[np.diff(smoothed.data.trajectory) == 0]

@@ -1,30 +1,33 @@
 """Reads a log tolerantly, runs all checks on it, and formats the findings as a page of text."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from dln_jax.data import schema
-from dln_jax.data.checks.channels import FILTER, check_channels, check_times
-from dln_jax.data.checks.derivatives import check_derivatives
-from dln_jax.data.checks.energies import any_energy
-from dln_jax.data.checks.findings import Finding, by_severity
-from dln_jax.data.checks.hypotheses import Torques, examine_torques
-from dln_jax.data.checks.joints import check_degrees, check_torques
-from dln_jax.data.checks.tree import OnTree, against_tree
-from dln_jax.data.encoders.clock import clock_line
-from dln_jax.data.encoders.repeats import Repeats, without_repeats
-from dln_jax.data.encoders.sampling import step_of, timing
+from dln_jax.data.checks.channels import (
+    FARTHEST,
+    FILTER,
+    SEVERITIES,
+    Finding,
+    check_channels,
+    check_derivatives,
+    check_times,
+)  # fmt: skip
+from dln_jax.data.checks.priors import any_energy
+from dln_jax.data.checks.torques import Torques, check_degrees, check_torques, examine_torques
+from dln_jax.data.checks.tree import OnTree, compare_with_tree
+from dln_jax.data.encoders.sampling import Repeats, step_of, timing, without_repeats
 from dln_jax.data.encoders.smoothing import Smoothed, smooth
 from dln_jax.data.repeated_motions import motion_numbers
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.types import InputError
 
-FARTHEST = 0.25
-"""s: largest delay between q and tau tested; at most `MOST_SHIFTS` samples."""
 MOST_SHIFTS = 20
+"""Largest delay between q and tau tested, in samples."""
 EQUATIONS, EACH = 300, 100
 """Number of torques used to search for faults: the minimum over all joints, and the number per joint."""
 BLINDING = ("saturation-tau", "saturation-q", "dead-torque", "constant-torque", "unexcited")
@@ -34,89 +37,66 @@ WIDTH = 10
 ESTIMATED = "--cutoff auto, or data.encoders.smooth(), filters q before rates are derived"
 
 
-class Recording(NamedTuple):
-    """Trajectories in order of time, with findings on repairs."""
-
-    data: Trajectories
-    repaired: tuple[Finding, ...] = ()
-
-
 class Examination(NamedTuple):
     """Findings, and the intermediate results behind them."""
 
     findings: list[Finding]
     """Most severe first."""
-    recording: Recording
+    data: Trajectories
     smoothed: Smoothed | None
     """The log with rates of filtered coordinates; `None` if no segment is long enough."""
-    regression: Torques | None
-    """Examination of the torques without a robot; `None` without torques, with too few samples, or with a robot."""
+    torques: Torques | None
+    """Examination of the torques, with the robot if there is one; `None` without torques or with too few samples."""
     on_tree: OnTree | None
     """Comparison with the robot's description; `None` without one."""
-    steps: np.ndarray
-    """Encoder resolution, rad or m [d]; zero for channels without steps."""
-
-    @property
-    def torques(self) -> Torques | None:
-        """Examination of the torques, with the robot if there is one."""
-        return self.regression if self.on_tree is None else self.on_tree.torques
 
 
-def as_recording(data: Trajectories) -> Recording:
-    """Wraps trajectories that have already been read."""
-    return Recording(data)
+def read(path: str | Path, **stated: Any) -> tuple[Trajectories, list[Finding]]:
+    """Reads a file as `schema.load` does, but sorts samples by time, drops duplicates, and reports both."""
+    findings: list[Finding] = []
 
+    def repair(arrays: dict[str, Any]) -> dict[str, Any]:
+        t, trajectory = (np.asarray(arrays.get(key, np.zeros(0))) for key in ("t", "trajectory"))
+        if t.ndim != 1 or t.shape != trajectory.shape or not np.issubdtype(t.dtype, np.number) or not len(t):
+            return arrays  # the schema refuses them
+        order = np.lexsort((t, trajectory))
+        same = np.r_[False, (np.diff(t[order]) == 0) & (np.diff(trajectory[order]) == 0)]
+        backward, double = int(np.sum(np.diff(t)[np.diff(trajectory) == 0] < 0)), int(same.sum())
+        if backward:
+            decreases = f"t decreases at {backward} sample(s)"
+            findings.append(Finding("error", "time-order", decreases, "sort each trajectory by time (done here)"))
+        if double:
+            repeated = f"{double} sample(s) have the time of the one before"
+            remedy = "keep one sample for each time (the first was kept here)"
+            findings.append(Finding("error", "time-double", repeated, remedy))
+        if not findings:
+            return arrays
+        per_sample = {
+            key: np.asarray(array)[order[~same]]
+            for key, array in arrays.items()
+            if np.shape(array)[:1] == t.shape and key not in ("label", "joint_names")
+        }
+        return arrays | per_sample
 
-def read(path: str | Path, **stated: Any) -> Recording:
-    """Reads a file as `schema.load` does, but repairs and reports samples out of order and duplicates."""
-    return schema.load_arrays(path, _from_arrays, **stated)
-
-
-def _from_arrays(arrays: dict[str, Any]) -> Recording:
-    kept, repaired = _in_order(arrays)
-    return Recording(schema.from_arrays(kept), repaired)
-
-
-def _in_order(arrays: dict[str, Any]) -> tuple[dict[str, Any], tuple[Finding, ...]]:
-    """Groups samples by trajectory, sorts them by time and drops duplicates after the first."""
-    t, trajectory = (np.asarray(arrays.get(key, np.zeros(0))) for key in ("t", "trajectory"))
-    if t.ndim != 1 or t.shape != trajectory.shape or not np.issubdtype(t.dtype, np.number) or not len(t):
-        return arrays, ()  # the schema refuses them
-    order = np.lexsort((t, trajectory))
-    same = np.r_[False, (np.diff(t[order]) == 0) & (np.diff(trajectory[order]) == 0)]
-    backward, double = int(np.sum(np.diff(t)[np.diff(trajectory) == 0] < 0)), int(same.sum())
-    repeated, first = f"{double} sample(s) have the time of the one before", "keep one sample for each time"
-    cases = (
-        (backward, "time-order", f"t decreases at {backward} sample(s)", "sort each trajectory by time (done here)"),
-        (double, "time-double", repeated, f"{first} (the first was kept here)"),
-    )
-    repaired = tuple(Finding("error", check, text, remedy) for count, check, text, remedy in cases if count)
-    if not repaired:
-        return arrays, ()
-    kept = order[~same]
-    return {
-        key: np.asarray(array)[kept]
-        if np.shape(array)[:1] == (len(t),) and key not in ("label", "joint_names")
-        else array
-        for key, array in arrays.items()
-    }, repaired
+    return schema.load(path, **stated, repair=repair), findings
 
 
 def quick(data: Trajectories, robot: Robot | None = None) -> list[Finding]:
     """Findings of all checks, most severe first; arguments as for `examine`."""
-    return examine(as_recording(data), robot).findings
+    return examine(data, robot).findings
 
 
-def examine(recording: Recording, robot: Robot | None = None) -> Examination:
+def examine(data: Trajectories, robot: Robot | None = None, *, repaired: Sequence[Finding] = ()) -> Examination:
     """Runs all checks.
 
     Args:
+        data: log as it was read.
         robot: description of the robot, with the joints of the data.
+        repaired: findings of `read`.
 
     Raises:
         InputError: the robot and the data have different numbers of joints.
     """
-    data = recording.data
     d, needs = data.degrees_of_freedom, data.needs
     equations = max(EQUATIONS, EACH * d)
     joints = needs.joints if needs is not None else ("revolute",) * d
@@ -127,46 +107,42 @@ def examine(recording: Recording, robot: Robot | None = None) -> Examination:
                 f"the robot has {len(joints)} joints, but the data have {d}; lock those that do not move: "
                 "--lock NAME,NAME"
             )
-    findings = [*recording.repaired, *check_times(data), *_repeated_motions(data)]
-    data, repeats = without_repeats(data)
+    findings = [*repaired, *check_times(data), *_repeated_motions(data)]
+    distinct, repeats = without_repeats(data)
     findings += _repeated(repeats)
     try:
-        even = smooth(recording.data, trim=0.0)  # which removes the repeats itself, and knows where they were
+        even = smooth(data, trim=0.0)  # which removes the repeats itself, and knows where they were
     except InputError:  # single states, or motions of a few samples: their rates cannot be checked
         even = None
     if even is not None and even.clock is not None:
         findings = [finding for finding in findings if finding.check != "jitter"]
-        findings.append(Finding("warning", "arrival", clock_line(even.clock), FILTER))
-    findings += check_channels(recording.data, None if even is None else even.data.qd)
-    driven = "tau" not in data.estimated and bool(np.ptp(data.tau, axis=0).any())
+        findings.append(Finding("warning", "arrival", even.clock.line, FILTER))
+    findings += check_channels(data, None if even is None else even.data.qd)
+    driven = "tau" not in data.estimated and bool(np.ptp(distinct.tau, axis=0).any())
     farthest = 0 if even is None else int(np.clip(round(FARTHEST * even.rate), 2, MOST_SHIFTS))
-    regression = on_tree = None
+    torques = on_tree = None
     if even is not None:
-        findings += _noise(data, even)
-        findings += check_derivatives(data, even)
+        findings += [*_noise(distinct, even), *check_derivatives(distinct, even)]
         findings += check_degrees(even.data, joints, driven=driven)
-        # Wrong units, and channels that are clipped or dead, make the signs of torques inconclusive.
+        # Wrong units, and channels that are clipped or dead, make the signs of torques inconclusive. Every torque must
+        # vary and act on its coordinate directly.
         sound = not any(finding.severity == "error" or finding.check in BLINDING for finding in findings)
-        if driven and sound and robot is None and _one_motor_per_joint(data):
-            regression = examine_torques(
+        direct = needs is None or (needs.actuation is None and needs.joint_map is None)
+        if driven and sound and robot is None and direct and np.ptp(distinct.tau, axis=0).all():
+            torques = examine_torques(
                 even.data, any_energy(tuple(joints)), farthest=farthest, equations=equations, alone=True
             )
-        if regression is not None:
+        if torques is not None:
             stated = needs is not None and bool(needs.friction or needs.joint_friction)
-            findings += check_torques(even.data, regression, friction_stated=stated, with_robot=False)
+            findings += check_torques(torques, friction_stated=stated, with_robot=False)
     if robot is not None:
-        samples = data if even is None else even.data
+        samples = distinct if even is None else even.data
         names = () if data.joint_names is None else tuple(map(str, data.joint_names))
-        on_tree = against_tree(samples, robot, names, driven=driven, farthest=farthest, equations=equations)
+        on_tree = compare_with_tree(samples, robot, names, driven=driven, farthest=farthest, equations=equations)
         findings += on_tree.findings
-    return Examination(by_severity(findings), recording, even, regression, on_tree, step_of(recording.data.q))
-
-
-def _one_motor_per_joint(data: Trajectories) -> bool:
-    """Whether every torque varies and acts on its coordinate directly."""
-    needs = data.needs
-    varies = bool(np.ptp(data.tau, axis=0).all())
-    return varies and (needs is None or (needs.actuation is None and needs.joint_map is None))
+        torques = on_tree.torques
+    findings.sort(key=lambda finding: SEVERITIES.index(finding.severity))
+    return Examination(findings, data, even, torques, on_tree)
 
 
 def _repeated(repeats: Repeats) -> list[Finding]:
@@ -205,7 +181,7 @@ def _noise(data: Trajectories, even: Smoothed) -> list[Finding]:
 
 def report(examined: Examination, name: str) -> list[str]:
     """Lines of text; findings come last, most severe first."""
-    data, smoothed = examined.recording.data, examined.smoothed
+    findings, data, smoothed, torques, on_tree = examined
     count = len(np.unique(data.trajectory))
     lines = [f"{name}: {len(data.t)} samples of {count} trajectories, {data.degrees_of_freedom} joints", *data.remarks]
     if smoothed is not None:
@@ -217,13 +193,9 @@ def report(examined: Examination, name: str) -> list[str]:
             else f"the best low-pass of q has a cut-off of about {smoothed.cutoff:.3g} Hz (--cutoff auto)"
         )
     lines += ["", *_table(examined), ""]
-    on_tree, torques = examined.on_tree, examined.torques
     if on_tree is not None:
-        lines.append(
-            f"robot: the motions determine {on_tree.rank} of {on_tree.parameters} parameters, friction included (some "
-            f"are never determined alone); condition {on_tree.condition:.3g}"
-        )
-        lines.append("")
+        determined = f"the motions determine {on_tree.rank} of {on_tree.parameters} parameters, friction included"
+        lines += [f"robot: {determined} (some are never determined alone); condition {on_tree.condition:.3g}", ""]
     if torques is not None:
         by = "parameters near the robot's" if on_tree is not None else "an energy of any arm and friction"
         lines.append(
@@ -232,18 +204,16 @@ def report(examined: Examination, name: str) -> list[str]:
         )
     elif "tau" not in data.estimated:
         lines.append("torques: signs, order of columns and delay cannot be checked in this log")
-    if not examined.findings:
+    if not findings:
         lines.append("nothing was found")
-    return [*lines, *(finding.line for finding in examined.findings)]
+    return [*lines, *(finding.line for finding in findings)]
 
 
 def _table(examined: Examination) -> list[str]:
-    data, smoothed, on_tree, torques = (
-        examined.recording.data, examined.smoothed, examined.on_tree, examined.torques
-    )  # fmt: skip
+    _, data, smoothed, torques, on_tree = examined
     driven = "tau" not in data.estimated
-    columns = [("q from", "rad|m", data.q.min(axis=0)), ("to", "rad|m", data.q.max(axis=0))]
-    columns += [("step", "rad|m", examined.steps)]
+    columns = [("q from", "rad|m", data.q.min(axis=0))]
+    columns += [("to", "rad|m", data.q.max(axis=0)), ("step", "rad|m", step_of(data.q))]
     if smoothed is not None:
         columns += [("noise q", "rad|m", smoothed.noise_q)]
         columns += [("max |qd|", "1/s", np.abs(smoothed.data.qd).max(axis=0))]
