@@ -25,15 +25,16 @@ from jax.typing import DTypeLike
 from dln_jax.mechanics.equations import Canonical
 from dln_jax.mechanics.hamiltonian import Guess, HamiltonianSystem
 from dln_jax.mechanics.natural import NaturalHamiltonian
-from dln_jax.models.lagrangian import black_box_terms, structured_terms
 from dln_jax.models.model import (
     Model,
     Parameters,
     Scale,
+    black_box_terms,
     joint_features,
     model_of,
     per_coordinate,
     perceptrons,
+    structured_terms,
     viscous_dissipation,
 )
 from dln_jax.nn.activations import Activation, tanh

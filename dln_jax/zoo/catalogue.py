@@ -22,8 +22,7 @@ from dln_jax.models.hamiltonian import (
     make_structured_hamiltonian,
 )
 from dln_jax.models.joint_friction import with_joint_friction
-from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
-from dln_jax.models.model import Model
+from dln_jax.models.model import Model, make_black_box_lagrangian, make_delan
 from dln_jax.models.n_body import make_pairwise_hamiltonian
 from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian

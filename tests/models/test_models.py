@@ -20,7 +20,7 @@ from dln_jax.models.hamiltonian import (
     make_separable_hamiltonian,
     make_structured_hamiltonian,
 )
-from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
+from dln_jax.models.model import make_black_box_lagrangian, make_delan
 from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import build, describe
 from tests.models.random_parameters import drawn
