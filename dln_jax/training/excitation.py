@@ -19,7 +19,7 @@ from dln_jax.identification.excitation.task import Task, make_task
 from dln_jax.mechanics.trees.description import with_payload
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.models.model import Model, Parameters
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.trees import make_rigid_tree
 from dln_jax.runs.arguments import numbers_of
 from dln_jax.runs.progress import progress
 from dln_jax.runs.report import print_numbers

@@ -21,7 +21,7 @@ from dln_jax.control.regulators import lqr, region_of_attraction, regulated, swi
 from dln_jax.control.state_space import error, field_of, holding_controls, linearise
 from dln_jax.figures import style
 from dln_jax.figures.closed_loops import rotary_pendulum_drawing, write_closed_loop_gif
-from dln_jax.scenes.poles import rotary_pendulum
+from dln_jax.scenes.pendulums import rotary_pendulum
 
 jax.config.update("jax_enable_x64", True)
 

@@ -13,7 +13,7 @@ from dln_jax.mechanics import hamiltonian, lagrangian
 from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.metrics.definiteness import definiteness
+from dln_jax.metrics.errors import definiteness
 from dln_jax.models.baselines import make_feed_forward
 from dln_jax.models.hamiltonian import (
     make_black_box_hamiltonian,

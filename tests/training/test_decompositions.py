@@ -16,7 +16,7 @@ from dln_jax.data import schema
 from dln_jax.data.schema import from_arrays
 from dln_jax.learning.gauges import summed_with_friction
 from dln_jax.mechanics import lagrangian
-from dln_jax.models.rigid_tree import USUAL
+from dln_jax.models.trees import USUAL
 from dln_jax.runs.arguments import arguments_of
 from dln_jax.scenes.datasets.generators import characters
 from dln_jax.training.dynamics.run import prepare

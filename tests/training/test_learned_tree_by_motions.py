@@ -8,7 +8,7 @@ from dln_jax import Needs, describe, dynamics
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import Split
 from dln_jax.mechanics.trees.inertia import inertial_parameters
-from dln_jax.models.serial_tree import SerialTreeParameters, make_serial_tree
+from dln_jax.models.trees import SerialTreeParameters, make_serial_tree
 from dln_jax.training.dynamics.methods.learned_tree import refined_by_motions
 
 NEEDS = Needs(joints=("revolute",), friction=True)

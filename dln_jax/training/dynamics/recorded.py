@@ -13,7 +13,7 @@ from dln_jax.data.splits import BLOCKS, LEAST_TRAJECTORIES, Split, in_blocks, sp
 from dln_jax.data.stated_tests import is_cut, stated_test
 from dln_jax.files import read_json
 from dln_jax.learning.kinematics.frames import KinematicPrior, kinematic_prior_from_json
-from dln_jax.models.rigid_tree import USUAL
+from dln_jax.models.trees import USUAL
 from dln_jax.runs.arguments import names_listed, refuse_given, require_positive_if_given
 from dln_jax.runs.encoders import facts, fitted_torque, needs_from_option, prepare_log, without_torque
 from dln_jax.scenes.datasets.generators import CHARACTERS_TEST, default_data

@@ -13,7 +13,7 @@ from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction.curves import joint_dissipation
 from dln_jax.mechanics.trees.recursions import tree_system
-from dln_jax.metrics.definiteness import Definiteness, definiteness
+from dln_jax.metrics.errors import Definiteness, definiteness
 from dln_jax.metrics.rollouts import Motion
 from dln_jax.metrics.verdict import (
     FAR_FROM_NOISE,

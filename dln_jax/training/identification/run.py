@@ -20,7 +20,7 @@ from dln_jax.identification.residual import ResidualFit
 from dln_jax.mechanics.trees.motors import armature_matrix
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.metrics.verdict import Verdict
-from dln_jax.models.rigid_tree import pairs_of
+from dln_jax.models.trees import pairs_of
 from dln_jax.runs.report import Report, png
 from dln_jax.training.identification.additions import (
     ADDED,

@@ -25,7 +25,7 @@ from dln_jax.mechanics.trees.recursions import newton_euler
 from dln_jax.runs.arguments import arguments_of
 from dln_jax.runs.encoders import FILTERED, prepare_log
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole
 
 SAMPLES, RUNS = 700, 4
 RIGHT = np.pi / 2

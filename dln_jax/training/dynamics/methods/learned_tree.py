@@ -15,8 +15,7 @@ from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.kinematics.fit import fit_tree
 from dln_jax.learning.kinematics.search import Search
 from dln_jax.learning.objectives import Objective
-from dln_jax.models.rigid_tree import USUAL, make_rigid_tree
-from dln_jax.models.serial_tree import SerialTreeParameters, tree_of
+from dln_jax.models.trees import USUAL, SerialTreeParameters, make_rigid_tree, tree_of
 from dln_jax.training.dynamics.methods.direct import refined_if_asked, training_of
 from dln_jax.training.dynamics.options import TreeOptions
 from dln_jax.training.dynamics.recorded import Recorded

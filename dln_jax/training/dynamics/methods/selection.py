@@ -28,8 +28,7 @@ from dln_jax.learning.objectives import SCALED_TORQUE, Objective, require_scales
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees.description import tree_to_json
 from dln_jax.models.model import Model, Parameters
-from dln_jax.models.rigid_tree import USUAL, RigidTreeParameters
-from dln_jax.models.serial_tree import tree_of
+from dln_jax.models.trees import USUAL, RigidTreeParameters, tree_of
 from dln_jax.runs.arguments import class_with, require_positive_if_given
 from dln_jax.training.dynamics.methods.direct import training_of
 from dln_jax.training.dynamics.methods.learned_tree import needs_of_tree
