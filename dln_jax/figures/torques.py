@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from dln_jax.data.schema import Trajectories
 from dln_jax.figures import style
 from dln_jax.metrics.coverage import LEVEL, coverage, half_width
-from dln_jax.metrics.rollouts import Motion, valid_prediction_times
+from dln_jax.metrics.motions import Motion, valid_prediction_times
 
 PARTS = {"tau": "torque", "tau_inertial": "inertial", "tau_coriolis": "Coriolis", "tau_gravity": "gravity"}
 MOST_JOINTS, MOST_MOTIONS, MOST_PATHS = 4, 6, 24

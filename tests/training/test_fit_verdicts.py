@@ -7,7 +7,7 @@ from dln_jax import LagrangianSystem, Needs, dynamics
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import Split, select
 from dln_jax.learning.objectives import CANONICAL, STATED
-from dln_jax.metrics.rollouts import Motion
+from dln_jax.metrics.motions import Motion
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.training.dynamics.task import Task
 from dln_jax.training.dynamics.verdict import judge_fit

@@ -13,7 +13,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.learning.linear import design
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.errors import prediction_program, samples_of
-from dln_jax.metrics.rollouts import Records, metrics_of_motions, motion_program, records_of
+from dln_jax.metrics.motions import Records, metrics_of_motions, motion_program, records_of
 from dln_jax.models.model import Model
 from dln_jax.precision import data_type
 from dln_jax.training.dynamics.task import Task

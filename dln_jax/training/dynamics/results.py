@@ -15,7 +15,7 @@ from dln_jax.learning.engine.problem import Training
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.metrics.errors import as_arrays, errors, mean_square, samples_of
 from dln_jax.metrics.latency import Latency, one_step
-from dln_jax.metrics.rollouts import Motion, by_trajectory, metrics_of_motions, records_of
+from dln_jax.metrics.motions import Motion, by_trajectory, metrics_of_motions, records_of
 from dln_jax.metrics.verdict import Verdict
 from dln_jax.precision import data_type
 from dln_jax.runs.report import png

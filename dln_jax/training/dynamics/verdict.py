@@ -14,7 +14,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction.curves import joint_dissipation
 from dln_jax.mechanics.trees.recursions import tree_system
 from dln_jax.metrics.errors import Definiteness, definiteness
-from dln_jax.metrics.rollouts import Motion
+from dln_jax.metrics.motions import Motion
 from dln_jax.metrics.verdict import (
     FAR_FROM_NOISE,
     HeldOut,
