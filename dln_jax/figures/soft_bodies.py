@@ -82,7 +82,7 @@ def energies_against_time(
         axis.fill_between(t, total, total[0], color="0.87", linewidth=0, zorder=0, label=taken)
     axis.set(xlabel="t, s", ylabel=f"energy, {unit}", xlim=(t[0], t[-1]))
     style.title(axis, title)
-    style.legend(figure, *axis.get_legend_handles_labels(), loc="outside right upper")
+    style.legend_beside(figure, axis, columns=1, place="outside right upper")
     return figure
 
 

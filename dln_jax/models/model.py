@@ -19,6 +19,7 @@ positive, and for scales that are neither one number nor one per coordinate.
 
 import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -29,7 +30,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from dln_jax.mechanics.arguments import OfSize
+from dln_jax.mechanics.arguments import require_shape
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
@@ -57,6 +58,21 @@ class Model(NamedTuple):
     """Random key -> parameters."""
     energies: Callable[[Parameters], Any]
     """Parameters -> a record of energies, one of `mechanics.equations.System`, as functions of one state."""
+
+
+@dataclass(frozen=True, eq=False)
+class OfSize:
+    """An energy of vectors [size], which refuses other sizes."""
+
+    function: Callable[..., Any]
+    size: int
+
+    def __call__(self, *state: Array) -> Any:
+        """Returns the energy; raises `InputError` for vectors of another size."""
+        for vector in state:
+            if vector.shape != (self.size,):
+                require_shape("a state of this model", vector.shape, (self.size,))
+        return self.function(*state)
 
 
 def make_delan(

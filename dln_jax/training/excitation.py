@@ -9,7 +9,7 @@ import numpy as np
 from dln_jax.data import schema
 from dln_jax.data.csv_tables import write_motion
 from dln_jax.data.robots import Robot, read_robot
-from dln_jax.figures.joints import excitation_figure
+from dln_jax.figures.torques import excitation_figure
 from dln_jax.files import write_figure, write_json
 from dln_jax.identification.excitation.candidates import Design, random_designs
 from dln_jax.identification.excitation.design import CRITERIA, as_trajectories, design_set, error_ratio, together

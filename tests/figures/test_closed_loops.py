@@ -12,7 +12,7 @@ from dln_jax.figures.closed_loops import (
     rotary_pendulum_drawing,
     write_closed_loop_gif,
 )
-from dln_jax.figures.joints import friction_curves
+from dln_jax.figures.torques import friction_curves
 
 T = np.linspace(0, 1, 51)
 Q = np.stack([0.1 * np.sin(3 * T), np.pi * (1 - T)], axis=1)

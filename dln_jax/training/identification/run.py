@@ -9,8 +9,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from dln_jax.data.robot_files import write_robot
-from dln_jax.figures.joints import friction_curves
-from dln_jax.figures.torques import torque_by_joint
+from dln_jax.figures.torques import friction_curves, torque_by_joint
 from dln_jax.files import write_bytes, write_json
 from dln_jax.identification.consistent import is_consistent
 from dln_jax.identification.identify import Identification, identify, parameters_of
