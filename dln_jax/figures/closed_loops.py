@@ -17,7 +17,6 @@ from dln_jax.figures import style
 from dln_jax.figures.animations import DPI, write_gif
 from dln_jax.types import InputError, JointKind, require_positive
 
-LIMIT = style.VERMILLION
 MOST_SHOWN = 30
 """Largest number of runs whose traces are drawn."""
 Drawing = Callable[[Axes, Float[np.ndarray, "T d"], int], Callable[[int], None]]
@@ -64,7 +63,7 @@ def closed_loop_traces(
     for joint, (axis, kind) in enumerate(zip(axes[:d, 0], joints, strict=True)):
         values, level = x[:MOST_SHOWN, :, joint], goal[joint]
         if kind == "revolute":
-            values, level = _wrapped(values - level), 0.0
+            values, level = np.arctan2(np.sin(values - level), np.cos(values - level)), 0.0
             angle_ticks(axis.yaxis)
             axis.set_ylim(-1.05 * np.pi, 1.05 * np.pi)
         _curves(axis, t, values, turning=kind == "revolute")
@@ -75,7 +74,7 @@ def closed_loop_traces(
         axis.plot(t[:-1], u[0, :, control], color=style.BLUE, linewidth=1.6, drawstyle="steps-post")
         for limit in limits:
             if np.isfinite(level := np.broadcast_to(limit, m)[control]):
-                axis.axhline(level, color=LIMIT, linewidth=1.2)
+                axis.axhline(level, color=style.VERMILLION, linewidth=1.2)
         axis.set_ylabel(f"control, {unit}" if m == 1 else f"u{control + 1}, {unit}")
         axis.margins(y=0.15)
     if energy is not None:
@@ -94,10 +93,6 @@ def _curves(axis: Axes, t: np.ndarray, values: np.ndarray, *, turning: bool = Fa
     for number in reversed(range(len(values))):
         colour, width = (style.SKY, 0.6) if number else (style.BLUE, 1.6)
         axis.plot(t, _with_gaps(values[number]) if turning else values[number], color=colour, linewidth=width)
-
-
-def _wrapped(angle: np.ndarray) -> np.ndarray:
-    return np.arctan2(np.sin(angle), np.cos(angle))
 
 
 def _with_gaps(angle: np.ndarray) -> np.ndarray:

@@ -38,7 +38,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.friction.curves import joint_dissipation
@@ -95,7 +95,10 @@ def make_trigonometric(
     degrees = _per_joint("degree", degree, d)
     of_potential = degrees if potential_degree is None else _per_joint("potential_degree", potential_degree, d)
     mass_basis = functools.partial(basis, needs.joints, degrees)
-    spring_degrees = potential_degrees(needs.joints, of_potential)
+    spring_degrees = tuple(
+        max(n, SPRING_DEGREE) if joint == "prismatic" else n
+        for joint, n in zip(needs.joints, of_potential, strict=True)
+    )
     potential_basis = functools.partial(basis, needs.joints, spring_degrees)
     rows, columns = np.tril_indices(d)
     # (i, j) and (j, i) of M read the same row of coefficients.
@@ -119,7 +122,24 @@ def make_trigonometric(
             friction=jnp.zeros(d, dtype) if needs.friction else None,
         )
 
-    return Model(init, lambda parameters: _closed_form(parameters, entry, mass_basis, potential_basis))
+    def energies(parameters: TrigonometricParameters) -> ClosedForm:
+        coefficients, potential, friction = parameters.mass[entry], parameters.potential, parameters.friction
+
+        def coriolis(q: Vector, qd: Vector) -> Vector:
+            slopes = mass_basis(q).slopes
+            kinetic = 0.5 * jnp.einsum("i,ijl,j->l", qd, coefficients, qd)
+            return (coefficients @ (qd @ slopes)) @ qd - slopes @ kinetic
+
+        return ClosedForm(
+            mass_matrix=lambda q: coefficients @ mass_basis(q).values,
+            coriolis=coriolis,
+            potential=None if potential is None else lambda q: potential_basis(q).values[1:] @ potential,
+            gravity=None if potential is None else lambda q: potential_basis(q).slopes[:, 1:] @ potential,
+            dissipation=None if friction is None else lambda q, qd: 0.5 * jnp.sum(friction * qd**2),
+            friction=None if friction is None else lambda q, qd: friction * qd,
+        )
+
+    return Model(init, energies)
 
 
 def _per_joint(name: str, degree: int | tuple[int, ...], d: int) -> tuple[int, ...]:
@@ -127,11 +147,6 @@ def _per_joint(name: str, degree: int | tuple[int, ...], d: int) -> tuple[int, .
     if len(degrees) != d or not all(isinstance(n, int) and n >= 0 for n in degrees):
         raise InputError(f"{name} is {degree}; expected a whole number >= 0, or one for each of the {d} joints")
     return degrees
-
-
-def potential_degrees(joints: tuple[JointKind, ...], degrees: tuple[int, ...]) -> tuple[int, ...]:
-    """Returns the degrees of the potential's basis, which includes a linear spring in every prismatic displacement."""
-    return tuple(max(n, SPRING_DEGREE) if joint == "prismatic" else n for joint, n in zip(joints, degrees, strict=True))
 
 
 def basis(joints: tuple[JointKind, ...], degrees: tuple[int, ...], q: Vector) -> Basis:
@@ -165,26 +180,6 @@ def _size(joints: tuple[JointKind, ...], degrees: tuple[int, ...]) -> int:
     """Returns B."""
     sizes = (2 * n + 1 if joint == "revolute" else n + 1 for joint, n in zip(joints, degrees, strict=True))
     return int(np.prod([*sizes]))
-
-
-def _closed_form(
-    parameters: TrigonometricParameters, entry: Int[np.ndarray, "d d"], mass_basis, potential_basis
-) -> ClosedForm:
-    coefficients, potential, friction = parameters.mass[entry], parameters.potential, parameters.friction
-
-    def coriolis(q: Vector, qd: Vector) -> Vector:
-        slopes = mass_basis(q).slopes
-        kinetic = 0.5 * jnp.einsum("i,ijl,j->l", qd, coefficients, qd)
-        return (coefficients @ (qd @ slopes)) @ qd - slopes @ kinetic
-
-    return ClosedForm(
-        mass_matrix=lambda q: coefficients @ mass_basis(q).values,
-        coriolis=coriolis,
-        potential=None if potential is None else lambda q: potential_basis(q).values[1:] @ potential,
-        gravity=None if potential is None else lambda q: potential_basis(q).slopes[:, 1:] @ potential,
-        dissipation=None if friction is None else lambda q, qd: 0.5 * jnp.sum(friction * qd**2),
-        friction=None if friction is None else lambda q, qd: friction * qd,
-    )
 
 
 class PlanarChainParameters(NamedTuple):

@@ -11,13 +11,6 @@ from dln_jax.types import InputError, Matrix, Needs, Scalar, Vector
 LINK_LENGTH = 1.0
 """Length of both links in m."""
 
-# Inertial and gravity constants of the published plant, kg m² and N m.
-_SHOULDER_INERTIA = 1.3727291666666667
-_ELBOW_INERTIA = 0.5176145833333333
-_COUPLING = 0.5
-_SHOULDER_WEIGHT = 2.625
-_ELBOW_WEIGHT = 1.5
-
 
 def pendulum(*, mass: float = 1.0, length: float = 1.0, acceleration: float = 9.81, friction: float = 0.0) -> Scene:
     """The pendulum with q = 0 hanging; in kg, m, m/s² (zero for no gravity) and N m s."""
@@ -81,8 +74,8 @@ def two_link_arm(*, zero: Literal["horizontal", "hanging"] = "horizontal") -> Sc
     `zero` is the posture at q = 0, which sets the gravity convention: "horizontal" is that of all published data
     (gravity in cos q), "hanging" that of most textbooks (gravity in sin q).
     """
-    inertias, weights = (_SHOULDER_INERTIA, _ELBOW_INERTIA, _COUPLING), (_SHOULDER_WEIGHT, _ELBOW_WEIGHT)
     name = "two-link-arm" if zero == "horizontal" else "two-link-arm-hanging"
+    inertias, weights = (1.3727291666666667, 0.5176145833333333, 0.5), (2.625, 1.5)
     return _two_links(name, inertias, weights, (LINK_LENGTH, LINK_LENGTH), hanging=zero == "hanging")
 
 
