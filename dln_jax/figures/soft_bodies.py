@@ -302,7 +302,7 @@ def soft_body_drawing(
     if actuation is not None and np.shape(actuation) != expected:
         raise InputError(f"actuation has shape {list(np.shape(actuation))}; expected {list(expected)}")
     points, plane = flattened(positions), mesh.dimension == 2
-    below = floor(positions, ground) if ground is not None and not plane else np.zeros((0, 2))
+    below = floor(positions, ground) if isinstance(ground, int | float) and not plane else np.zeros((0, 2))
     every = np.concatenate([points.reshape(-1, 2), below])
     low, high = np.nanmin(every, axis=0), np.nanmax(every, axis=0)
     margin = 0.06 * max(high - low)
