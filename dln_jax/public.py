@@ -27,8 +27,7 @@ from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalHamiltonian, NaturalSystem
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.recursions import tree_system
-from dln_jax.models.lagrangian import make_delan
-from dln_jax.models.model import Model
+from dln_jax.models.model import Model, make_delan
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build, describe
 from dln_jax.zoo.run import Run, load

@@ -21,8 +21,7 @@ from dln_jax.data import schema
 from dln_jax.runs.arguments import names_listed, parse
 from dln_jax.runs.options import CompilationCache
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.pendulums import pendulum
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole, pendulum
 from scripts.reports.run import arguments_of, chosen_cases
 
 ROOT = Path(__file__).parent.parent

@@ -1,9 +1,9 @@
 """Two desktop plants with friction, limits, encoders, noise and delay, and their swing-ups by any model.
 
-The cart-pole has Quanser's sizes (Lutter, Listmann and Peters 2019); the rotary pendulum has those of `scenes.poles`,
-similar to a QUBE. Dry friction of the driven joint is 3 % of the limit, and a third more at rest; that of the pole's
-hinge is 0.2 % (cart-pole) or 0.3 % of the torque of its weight. Both plants run at 500 Hz, with forces delayed by one
-sample. Below 5 mm/s or 10 mrad/s, dry friction stands in for stiction.
+The cart-pole has Quanser's sizes (Lutter, Listmann and Peters 2019); the rotary pendulum has those of
+`scenes.pendulums`, similar to a QUBE. Dry friction of the driven joint is 3 % of the limit, and a third more at rest;
+that of the pole's hinge is 0.2 % (cart-pole) or 0.3 % of the torque of its weight. Both plants run at 500 Hz, with
+forces delayed by one sample. Below 5 mm/s or 10 mrad/s, dry friction stands in for stiction.
 """
 
 from collections.abc import Callable, Mapping
@@ -25,7 +25,7 @@ from dln_jax.control.swing_up import SwingUp, SwingUpNumbers, Upright, swing_up,
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction.laws import FrictionCoefficients, FrictionShape
-from dln_jax.scenes.poles import cart_pole, rotary_pendulum
+from dln_jax.scenes.pendulums import cart_pole, rotary_pendulum
 from dln_jax.scenes.scene import Scene, with_friction
 from dln_jax.types import InputError
 

@@ -1,20 +1,31 @@
-"""Figures of closed loops: traces with limits, and the phase plane with a regulator's region."""
+"""Closed loops: traces with limits, and animated GIFs of the moving machine beside its control."""
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import FixedLocator, FuncFormatter
 
 from dln_jax.control.closed_loop import ClosedLoopRun
 from dln_jax.figures import style
-from dln_jax.types import InputError, JointKind
+from dln_jax.figures.animations import DPI, write_gif
+from dln_jax.types import InputError, JointKind, require_positive
 
-LIMIT = style.VERMILLION
 MOST_SHOWN = 30
 """Largest number of runs whose traces are drawn."""
+Drawing = Callable[[Axes, Float[np.ndarray, "T d"], int], Callable[[int], None]]
+"""(axis, q of all samples, number of samples in the tip's trace) -> function that draws a sample."""
+BODY, POLE, TIP, GROUND = "#3b4252", "#2e6fa7", style.VERMILLION, "0.72"
+TRACE = 0.8
+"""Duration of the tip's trace in s."""
+VIEW = np.deg2rad([35.0, 22.0])
+"""Azimuth and elevation of the view of machines in space, rad."""
 
 
 def closed_loop_traces(
@@ -52,7 +63,7 @@ def closed_loop_traces(
     for joint, (axis, kind) in enumerate(zip(axes[:d, 0], joints, strict=True)):
         values, level = x[:MOST_SHOWN, :, joint], goal[joint]
         if kind == "revolute":
-            values, level = _wrapped(values - level), 0.0
+            values, level = np.arctan2(np.sin(values - level), np.cos(values - level)), 0.0
             angle_ticks(axis.yaxis)
             axis.set_ylim(-1.05 * np.pi, 1.05 * np.pi)
         _curves(axis, t, values, turning=kind == "revolute")
@@ -63,7 +74,7 @@ def closed_loop_traces(
         axis.plot(t[:-1], u[0, :, control], color=style.BLUE, linewidth=1.6, drawstyle="steps-post")
         for limit in limits:
             if np.isfinite(level := np.broadcast_to(limit, m)[control]):
-                axis.axhline(level, color=LIMIT, linewidth=1.2)
+                axis.axhline(level, color=style.VERMILLION, linewidth=1.2)
         axis.set_ylabel(f"control, {unit}" if m == 1 else f"u{control + 1}, {unit}")
         axis.margins(y=0.15)
     if energy is not None:
@@ -77,57 +88,11 @@ def closed_loop_traces(
     return figure
 
 
-def phase_portrait(
-    angle: Any,
-    rate: Any,
-    *,
-    energy: tuple[Any, Any, Any] | None = None,
-    goal_energy: float | None = None,
-    caught: tuple[Any, float] | None = None,
-) -> Figure:
-    """Closed loops in the plane of an angle from upright and its rate, over energy levels, with the regulator's region.
-
-    Args:
-        angle: angles of the runs [K, T], rad; drawn from -pi to pi.
-        rate: their rates [K, T], rad/s.
-        energy: angles [a], rates [b] and the energy [b, a] on that grid, drawn as levels.
-        goal_energy: energy of the dashed level, along which the pole swings up by itself.
-        caught: S [2, 2] and a level; the regulator takes over where xᵀ S x is smaller.
-    """
-    figure, [[axis]] = style.figure(height=4.2)
-    angle, rate = _wrapped(np.asarray(angle)), np.asarray(rate)
-    if energy is not None:
-        axis.contourf(*energy, levels=18, cmap="Greys", alpha=0.35, zorder=0)
-        if goal_energy is not None:
-            axis.contour(*energy, levels=[goal_energy], colors="0.25", linestyles="--", linewidths=1.2)
-    for number in reversed(range(len(angle[:MOST_SHOWN]))):
-        q, qd = angle[number], rate[number]
-        colour, width, alpha, size = (style.SKY, 0.7, 0.6, 3) if number else (style.BLUE, 1.8, 1.0, 6)
-        axis.plot(_with_gaps(q), qd, color=colour, linewidth=width, alpha=alpha)
-        axis.plot(q[0], qd[0], "o", color=colour, markersize=size)
-    if caught is not None:
-        axis.fill(*_ellipse(*caught), facecolor=style.GREEN, edgecolor=style.GREEN, alpha=0.45, zorder=4)
-        axis.annotate(
-            "the regulator\ntakes over", (0, 0), (0.5, 0.93), xycoords="data", textcoords="axes fraction",
-            ha="center", va="top", fontsize=style.SMALL, color="#00563f",
-            arrowprops={"arrowstyle": "-", "color": style.GREEN, "linewidth": 0.8},
-        )  # fmt: skip
-    angle_ticks(axis.xaxis)
-    room = 1.12 * float(np.nanmax(np.abs(rate)))
-    axis.set(xlim=(-np.pi, np.pi), ylim=(-room, room), xlabel="angle from upright, rad", ylabel="rate, rad/s")
-    axis.grid(False)
-    return figure
-
-
 def _curves(axis: Axes, t: np.ndarray, values: np.ndarray, *, turning: bool = False) -> None:
     """Draws curves with the first in front; angles have gaps where they wrap."""
     for number in reversed(range(len(values))):
         colour, width = (style.SKY, 0.6) if number else (style.BLUE, 1.6)
         axis.plot(t, _with_gaps(values[number]) if turning else values[number], color=colour, linewidth=width)
-
-
-def _wrapped(angle: np.ndarray) -> np.ndarray:
-    return np.arctan2(np.sin(angle), np.cos(angle))
 
 
 def _with_gaps(angle: np.ndarray) -> np.ndarray:
@@ -142,8 +107,139 @@ def angle_ticks(side: Axis) -> None:
     side.set_major_formatter(FuncFormatter(lambda value, _: names[round(2 * value / np.pi)]))
 
 
-def _ellipse(S: Any, level: float) -> np.ndarray:
-    """Returns the curve xᵀ S x = level [2, 100]."""
-    turn = np.linspace(0, 2 * np.pi, 100)
-    sizes, axes = np.linalg.eigh(np.asarray(S))
-    return axes @ (np.sqrt(level / sizes)[:, None] * np.stack([np.cos(turn), np.sin(turn)]))
+def cart_pole_drawing(length: float) -> Drawing:
+    """Returns the drawing of a cart-pole with q = (cart, pole from upright) in m and rad; `length` of the pole in m."""
+
+    def prepare(axis: Axes, q: np.ndarray, trail: int) -> Callable[[int], None]:
+        wide, tall = 0.55 * length, 0.28 * length
+        tip = np.stack([q[:, 0] + length * np.sin(q[:, 1]), length * np.cos(q[:, 1])], axis=1)
+        low, high = q[:, 0].min() - 1.25 * length, q[:, 0].max() + 1.25 * length
+        axis.plot([low, high], [-tall / 2 - 0.07 * length] * 2, color=GROUND, linewidth=2.5, zorder=0)
+        cart = Rectangle((0, 0), wide, tall, facecolor=BODY, edgecolor="none", zorder=2)
+        wheels = [Circle((0, 0), 0.07 * length, facecolor="0.45", zorder=3) for _ in range(2)]
+        for patch in (cart, *wheels):
+            axis.add_patch(patch)
+        moving = _rod(axis, tip, trail)
+        axis.set(xlim=(low, high), ylim=(-1.25 * length, 1.25 * length), aspect="equal")
+        axis.set_axis_off()
+
+        def show(index: int) -> None:
+            x = q[index, 0]
+            cart.set_xy((x - wide / 2, -tall / 2))
+            for wheel, side in zip(wheels, (-1, 1), strict=True):
+                wheel.set_center((x + side * 0.3 * wide, -tall / 2))
+            moving(index, np.array([x, 0.0]))
+
+        return show
+
+    return prepare
+
+
+def rotary_pendulum_drawing(arm: float, pole: float) -> Drawing:
+    """Returns the drawing of a rotary pendulum, q = (arm, pole from upright) in rad, seen obliquely; lengths in m."""
+
+    def prepare(axis: Axes, q: np.ndarray, trail: int) -> Callable[[int], None]:
+        out = np.stack([np.cos(q[:, 0]), np.sin(q[:, 0]), 0 * q[:, 0]], axis=1)
+        across = np.stack([-np.sin(q[:, 0]), np.cos(q[:, 0]), 0 * q[:, 0]], axis=1)
+        hinge = arm * out
+        tip = hinge + pole * (np.sin(q[:, 1:]) * across + np.cos(q[:, 1:]) * np.array([0.0, 0.0, 1.0]))
+        turn = np.linspace(0, 2 * np.pi, 120)[:, None]
+        ring = np.concatenate([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+        floor, reach = np.array([0.0, 0.0, -1.1 * pole]), float(np.hypot(arm, pole))
+        disc, post = _seen(reach * ring + floor), _seen(np.stack([floor, np.zeros(3)]))
+        axis.fill(*disc.T, facecolor="0.95", edgecolor="none", zorder=0)
+        axis.plot(*_seen(arm * ring).T, color="0.85", linewidth=1.0, zorder=1)
+        axis.plot(*post.T, color=GROUND, linewidth=9, solid_capstyle="butt", zorder=1)
+        (shadow,) = axis.plot([], [], color="0.82", linewidth=4, solid_capstyle="round", zorder=0.5)
+        (beam,) = axis.plot([], [], color=BODY, linewidth=7, solid_capstyle="round", zorder=3)
+        axis.plot(*_seen(np.zeros((1, 3))).T, "o", color=BODY, markersize=13, zorder=3)
+        flat, hinges = _seen(tip), _seen(hinge)
+        moving = _rod(axis, flat, trail)
+        top = float(flat[:, 1].max()) + 0.12 * reach
+        axis.set(xlim=(-1.1 * reach, 1.1 * reach), ylim=(disc[:, 1].min() - 0.02 * reach, top), aspect="equal")
+        axis.set_axis_off()
+
+        def show(index: int) -> None:
+            beam.set_data(*np.stack([np.zeros(2), hinges[index]]).T)
+            fallen = np.stack([np.zeros(3), hinge[index], tip[index]]) * np.array([1.0, 1.0, 0.0]) + floor
+            shadow.set_data(*_seen(fallen).T)
+            moving(index, hinges[index])
+
+        return show
+
+    return prepare
+
+
+def write_closed_loop_gif(
+    path: Path,
+    drawing: Drawing,
+    t: Any,
+    q: Any,
+    u: Any,
+    *,
+    limits: tuple[float, float] = (-np.inf, np.inf),
+    unit: str = "N",
+    title: str = "",
+    frames_per_second: float = 25.0,
+) -> None:
+    """Writes a run in real time: the moving machine and its control.
+
+    Args:
+        drawing: drawing of the machine, such as `cart_pole_drawing(length)`.
+        t: times [T], s, with a spacing below that of the frames.
+        q: coordinates [T, d].
+        u: control [T], held constant from each time on.
+        limits: limits of the control, drawn in red.
+        frames_per_second: frame rate of the GIF, which plays the run in real time.
+
+    Raises:
+        InputError: arrays have different lengths, or coordinates are not finite.
+    """
+    require_positive(frames_per_second=frames_per_second)
+    t, q, u = np.asarray(t), np.asarray(q), np.asarray(u)
+    if not len(t) == len(q) == len(u) > 1 or not np.isfinite(q).all():
+        raise InputError(f"there are {len(t)} times, {len(q)} states, {len(u)} controls; expected as many, all finite")
+    samples = np.searchsorted(t, np.arange(t[0], t[-1], 1 / frames_per_second) - 1e-9)
+    figure, [[machine, trace]] = style.figure(1, 2, width=6.4, height=2.9, dpi=DPI, width_ratios=[1.5, 1.0])
+    machine.grid(False)
+    show_machine = drawing(machine, q, int(np.searchsorted(t, t[0] + TRACE)))
+    trace.plot(t, u, color="0.85", linewidth=1.0, drawstyle="steps-post")
+    (line,) = trace.plot([], [], color=style.BLUE, linewidth=1.4, drawstyle="steps-post")
+    (now,) = trace.plot([], [], "o", color=style.BLUE, markersize=4)
+    for limit in limits:
+        if np.isfinite(limit):
+            trace.axhline(limit, color=style.VERMILLION, linewidth=1.2)
+    trace.set(xlabel="t, s", ylabel=f"control, {unit}", xlim=(t[0], t[-1]))
+    trace.margins(y=0.12)
+
+    def show(index: int) -> None:
+        show_machine(index)
+        line.set_data(t[: index + 1], u[: index + 1])
+        now.set_data([t[index]], [u[index]])
+
+    write_gif(path, figure, show, t, frames=samples.tolist(), frames_per_second=frames_per_second, title=title)
+
+
+def _rod(axis: Axes, tip: np.ndarray, trail: int) -> Callable[[int, np.ndarray], None]:
+    """Draws a pole with a bob and its trace; returns a function that draws a sample from the position of the foot."""
+    (trace,) = axis.plot([], [], color=TIP, linewidth=1.2, alpha=0.45, zorder=1.5)
+    (pole,) = axis.plot([], [], color=POLE, linewidth=5, solid_capstyle="round", zorder=4)
+    (bob,) = axis.plot([], [], "o", color=TIP, markersize=9, zorder=5)
+    (pin,) = axis.plot([], [], "o", color="white", markersize=3.5, zorder=6)
+
+    def show(index: int, foot: np.ndarray) -> None:
+        trace.set_data(*tip[max(0, index - trail) : index + 1].T)
+        pole.set_data(*np.stack([foot, tip[index]]).T)
+        bob.set_data(*tip[index : index + 1].T)
+        pin.set_data(*foot[:, None])
+
+    return show
+
+
+def _seen(points: Any) -> np.ndarray:
+    """Projects points in space [..., 3] orthographically to the drawing plane [..., 2]."""
+    azimuth, elevation = VIEW
+    x, y, z = np.moveaxis(np.asarray(points), -1, 0)
+    right = x * np.cos(azimuth) + y * np.sin(azimuth)
+    back = -x * np.sin(azimuth) + y * np.cos(azimuth)
+    return np.stack([right, z * np.cos(elevation) + back * np.sin(elevation)], axis=-1)

@@ -7,7 +7,6 @@ from matplotlib.figure import Figure
 from dln_jax.data.checks.report import Examination
 from dln_jax.data.checks.torques import Torques
 from dln_jax.data.encoders.filters import Choice
-from dln_jax.data.encoders.smoothing import Smoothed
 from dln_jax.data.schema import Trajectories
 from dln_jax.figures import style
 
@@ -16,20 +15,6 @@ MOST_JOINTS = 9
 COLUMNS = 3
 MOST_POINTS = 3000
 """Largest number of points per joint."""
-
-
-def cutoff_figure(smoothed: Smoothed) -> Figure:
-    """Spectra of q above their noise floors and, below them, the expected error at every cut-off.
-
-    `smoothed` comes from `data.encoders.smooth` with an automatic cut-off.
-    """
-    if smoothed.choice is None:
-        raise ValueError("the cut-off was set, not chosen from the data")
-    figure, axes = style.figure(2, 1, height=4.6, sharex=True, height_ratios=[1.4, 1.0])
-    _spectra(axes[0, 0], smoothed.choice)
-    _expected(axes[1, 0], smoothed.choice)
-    axes[0, 0].set_xlabel("")
-    return figure
 
 
 def log_figure(examined: Examination) -> Figure:

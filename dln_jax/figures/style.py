@@ -1,4 +1,4 @@
-"""Common style of all figures: width, text sizes, a light grid, and one colour and marker per model.
+"""Common style of all figures: width, text sizes, a light grid, and one colour per model.
 
 Matplotlib's global state is neither read nor set: figures are made without pyplot, and settings that Matplotlib would
 apply later, when it makes ticks, are set on every axis.
@@ -28,41 +28,32 @@ CYCLE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, "#555555", "#882255")
 """Colours for everything but models (Okabe and Ito 2008, safe for colour-blind readers)."""
 MARKERS = "osv^Ddp*"
 
-MODELS: dict[str, tuple[str, str]] = {
-    "structured-delan": (BLUE, "o"),
-    "black-box-delan": (SKY, "s"),
-    "structured-hnn": (VERMILLION, "^"),
-    "black-box-hnn": (ORANGE, "v"),
-    "trigonometric": (GREEN, "D"),
-    "learned-tree": ("#117733", "d"),
-    "identified-arm": (GREEN, "D"),
-    "feed-forward": (PURPLE, "X"),
-    "separable-hnn": ("#B2182B", "^"),
-    "pairwise-hnn": ("#882255", "P"),
-    "polynomial-hamiltonian": ("#44AA99", "D"),
-    "phase-network": ("#7E57A6", "X"),
-    "differential-network": ("#332288", "o"),
-    **dict.fromkeys((TRUTH, "plant", "exact-model"), ("black", ".")),
-    "feedback-alone": (REFERENCE, "x"),
-    "published": (REFERENCE, "x"),
+MODELS: dict[str, str] = {
+    "structured-delan": BLUE,
+    "black-box-delan": SKY,
+    "structured-hnn": VERMILLION,
+    "black-box-hnn": ORANGE,
+    "trigonometric": GREEN,
+    "learned-tree": "#117733",
+    "identified-arm": GREEN,
+    "feed-forward": PURPLE,
+    "separable-hnn": "#B2182B",
+    "pairwise-hnn": "#882255",
+    "polynomial-hamiltonian": "#44AA99",
+    "phase-network": "#7E57A6",
+    "differential-network": "#332288",
+    **dict.fromkeys((TRUTH, "plant", "exact-model"), "black"),
+    "feedback-alone": REFERENCE,
+    "published": REFERENCE,
 }
-"""Colour and marker by name: Lagrangians are blue, Hamiltonians warm, linear models and trees green, others purple."""
-UNKNOWN = ("#555555", "h")
+"""Colours of models: Lagrangians are blue, Hamiltonians warm, linear models and trees green, others purple."""
+UNKNOWN = "#555555"
 
 
 def colour(name: str) -> str:
     """Returns the colour of a model or of its variant "MODEL-..."; grey for an unknown name."""
-    return _look(name)[0]
-
-
-def marker(name: str) -> str:
-    """Returns the marker of a model or of its variant; a default for an unknown name."""
-    return _look(name)[1]
-
-
-def _look(name: str) -> tuple[str, str]:
-    known = [model for model in MODELS if f"{name}-".startswith(f"{model}-")]
-    return MODELS[max(known, key=len)] if known else UNKNOWN
+    models = [model for model in MODELS if f"{name}-".startswith(f"{model}-")]
+    return MODELS[max(models, key=len)] if models else UNKNOWN
 
 
 def figure(
@@ -103,6 +94,12 @@ def title(axis: Axes, text: str, **options) -> None:
 def legend(of: Axes | Figure, *args, **options) -> Legend:
     """Adds a legend without a frame, in small text."""
     return of.legend(*args, **{"frameon": False, "fontsize": SMALL, **options})
+
+
+def legend_beside(figure: Figure, axis: Axes, *, columns: int, place: str = "outside lower center") -> None:
+    """Adds the legend of one of a figure's axes beside them, by default below."""
+    handles, labels = axis.get_legend_handles_labels()
+    legend(figure, handles, labels, loc=place, ncols=min(columns, len(labels)))
 
 
 def scale_of(values: Iterable[float | int]) -> str:

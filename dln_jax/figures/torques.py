@@ -1,7 +1,9 @@
-"""Figures of torques: parts and errors, bands, and torques by joint; also paths of an arm's tip under them."""
+"""Figures of torques: parts and errors, bands, torques and friction by joint, and motions that excite them."""
 
+import itertools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -12,11 +14,13 @@ from matplotlib.figure import Figure
 from dln_jax.data.schema import Trajectories
 from dln_jax.figures import style
 from dln_jax.metrics.coverage import LEVEL, coverage, half_width
-from dln_jax.metrics.rollouts import Motion, valid_prediction_times
+from dln_jax.metrics.motions import Motion, valid_prediction_times
 
 PARTS = {"tau": "torque", "tau_inertial": "inertial", "tau_coriolis": "Coriolis", "tau_gravity": "gravity"}
 MOST_JOINTS, MOST_MOTIONS, MOST_PATHS = 4, 6, 24
 """Largest numbers of joints, motions and paths shown."""
+MOST_COLUMNS, MOST_EXCITED = 4, 8
+"""Largest numbers of columns in a figure of friction, and of joints in one of excitation motions."""
 MOST_BANDS, MOST_BAND_SAMPLES = 7, 400
 """Largest numbers of joints and samples shown with bands."""
 MOST_SAMPLES = 4000
@@ -25,6 +29,7 @@ ROUNDING = 1e-9
 """Parts that vary less than this share of the torque are drawn as zero."""
 HIGH, LOW = 0.8, 0.36
 """Heights of a panel of forces and of a panel of errors, inches."""
+QUANTITIES: dict[Literal["q", "qd", "tau"], str] = {"q": "position", "qd": "velocity", "tau": "force"}
 
 
 def force_decomposition(
@@ -83,7 +88,7 @@ def force_decomposition(
             top.annotate(name, place, xycoords=("data", "axes fraction"), ha="center", fontsize=size, color="0.35")
         bottom.set_xlabel(time if moving else "test state")
     figure.align_ylabels(axes[:, 0])
-    style.legend(figure, *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    style.legend_beside(figure, axes[0, 0], columns=2)
     return figure
 
 
@@ -122,7 +127,7 @@ def torque_by_joint(
         label = f"block {int(block[2]) + 1} of recording {block[1]}"
     axes[-1, 0].set_xlabel(f"time, s (held out: {label})")
     figure.align_ylabels(axes[:, 0])
-    style.legend(figure, *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    style.legend_beside(figure, axes[0, 0], columns=3)
     return figure
 
 
@@ -165,7 +170,7 @@ def torque_bands(
         axis.set_ylabel(f"joint {joint + 1},\n{prefix}{style.unit_of(data, joint)}")
         axis.tick_params(axis="x", labelbottom=joint == d - 1)
         axis.margins(x=0.01)
-    style.legend(figure, *axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=2)
+    style.legend_beside(figure, axes[0], columns=2, place="outside lower left")
     axes[-1].set_xlabel("held-out sample; grey: out of distribution")
     right.plot([0, 1], [0, 1], color=style.REFERENCE, linewidth=1.0)
     right.fill_between([0, 1], [-0.05, 0.95], [0.03, 1.03], color=style.REFERENCE, alpha=0.15, linewidth=0)
@@ -222,4 +227,98 @@ def tip_paths(
     if len(times):
         caption = f"black: test; dashed: {model} driven by its torques until the prediction fails; grey: training"
         figure.supxlabel(caption, fontsize=style.SMALL)
+    return figure
+
+
+def friction_curves(
+    curves: Mapping[str, tuple[Any, Any]],
+    *,
+    names: Sequence[str] = (),
+    measured: tuple[Any, Any] | None = None,
+    rate_unit: str | Sequence[str] = "rad/s",
+    force_unit: str | Sequence[str] = "N m",
+) -> Figure:
+    """Friction curves, one panel per joint.
+
+    Args:
+        curves: rates [N, d] of the joints, in any order, and forces [N, d], by name of the curve.
+        names: names of the joints; by default their numbers.
+        measured: rates and forces [N, d], for example torque minus that of the links, drawn as points; the most extreme
+            hundredth may lie out of view.
+        rate_unit, force_unit: one unit for all joints, or one per joint.
+    """
+    arrays = {name: (np.asarray(rates), np.asarray(forces)) for name, (rates, forces) in curves.items()}
+    d = next(iter(arrays.values()))[0].shape[1]
+    rate_units, force_units = np.broadcast_to(rate_unit, d), np.broadcast_to(force_unit, d)
+    alike = len({*zip(rate_units, force_units, strict=True)}) == 1
+    columns = min(d, MOST_COLUMNS)
+    rows = -(-d // columns)
+    figure, axes = style.figure(rows, columns, height=0.6 + 2.4 * rows)
+    for axis in axes.flat[d:]:
+        axis.set_visible(False)
+    for joint, axis in enumerate(axes.flat[:d]):
+        if measured is not None:
+            rates, forces = (np.asarray(values)[:, joint] for values in measured)
+            every = slice(None, None, -(-len(rates) // MOST_SAMPLES))
+            points = {"color": style.REFERENCE, "markersize": 1.5, "rasterized": True, "label": "measured"}
+            axis.plot(rates[every], forces[every], ".", **points)
+            seen = [np.percentile(forces, [0.5, 99.5]), *(forces[:, joint] for _, forces in arrays.values())]
+            low, high = float(min(map(np.min, seen))), float(max(map(np.max, seen)))
+            room = 0.1 * (high - low) or 1.0
+            axis.set_ylim(low - room, high + room)
+        for colour, (name, (rates, forces)) in zip(itertools.cycle(style.CYCLE), arrays.items(), strict=False):
+            order = np.argsort(rates[:, joint])
+            axis.plot(rates[order, joint], forces[order, joint], color=colour, linewidth=1.3, label=name)
+        axis.axhline(0, color="black", linewidth=0.5)
+        axis.locator_params(axis="x", nbins=5)
+        if d > 1:
+            style.title(axis, names[joint] if names else f"joint {joint + 1}")
+        if joint >= d - columns or not alike:
+            axis.set_xlabel(f"rate, {rate_units[joint]}")
+        if joint % columns == 0 or not alike:
+            axis.set_ylabel(f"friction, {force_units[joint]}")
+    style.legend_beside(figure, axes[0, 0], columns=4)
+    return figure
+
+
+def excitation_figure(
+    data: Trajectories, limits: Mapping[str, Any], *, names: Sequence[str], conditions: Mapping[str, Sequence[float]]
+) -> Figure:
+    """One column per joint with q, qd and tau of every motion and dashed limits; below, conditions of the regressor.
+
+    Args:
+        data: the motions, of equal length.
+        limits: lower and upper limits [d, 2] by "q", "qd" and "tau"; infinite ones are not drawn.
+        conditions: condition numbers of the regressor, by name of the set of motions.
+    """
+    joints = min(data.degrees_of_freedom, MOST_EXCITED)
+    figure = style.blank(height=5.6)
+    upper, lower = figure.subfigures(2, 1, height_ratios=(3.4, 1.2), squeeze=False)[:, 0]
+    axes, below = upper.subplots(len(QUANTITIES), joints, squeeze=False, sharex=True), lower.subplots()
+    style.prepare(*axes.flat, below)
+    colours = style.colours_of(data.label)
+    for line, (key, quantity) in zip(axes, QUANTITIES.items(), strict=True):
+        for joint, axis in enumerate(line):
+            for index, name in enumerate(data.label):
+                samples = data.trajectory == index
+                look = {"color": colours[name], "linewidth": 0.8, "label": str(name)}
+                axis.plot(data.t[samples], getattr(data, key)[samples, joint], **look)
+            for bound in limits[key][joint]:
+                if np.isfinite(bound):
+                    axis.axhline(bound, color=style.REFERENCE, linestyle="--", linewidth=0.9)
+            axis.tick_params(labelsize=6.5)
+        line[0].set_ylabel(f"{quantity}, {style.unit_of(data, 0, key)}")
+    for joint in range(joints):
+        unit = style.unit_of(data, joint, "q")
+        differs = "" if unit == style.unit_of(data, 0, "q") else f" ({unit})"
+        style.title(axes[0, joint], f"{names[joint]:.12}{differs}", fontsize=style.SMALL)
+        axes[-1, joint].set_xlabel("time, s", fontsize=style.SMALL)
+    for place, (name, values) in enumerate(conditions.items()):
+        shade = style.REFERENCE if name == "random" else style.BLUE
+        below.plot(values, np.full(len(values), place), "o", color=shade, markersize=4, alpha=0.8)
+    below.set_yticks(range(len(conditions)), list(conditions))
+    below.set_ylim(len(conditions) - 0.5, -0.5)
+    below.set_xscale(style.scale_of(itertools.chain(*conditions.values())))
+    below.set_xlabel("condition of the regressor, columns of unit length")
+    style.legend_beside(figure, axes[0, 0], columns=6)
     return figure

@@ -35,8 +35,7 @@ from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Problem
 from dln_jax.learning.objectives import TORQUE, Objective
 from dln_jax.learning.uncertainty import effective_samples
-from dln_jax.models.lagrangian import make_delan
-from dln_jax.models.model import Model, Parameters
+from dln_jax.models.model import Model, Parameters, make_delan
 from dln_jax.solvers.normal_equations import count
 from dln_jax.types import Needs, require_seed
 

@@ -28,7 +28,7 @@ from dln_jax.mechanics.friction.laws import FrictionShape, coefficients_of
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.motors import Pair
 from dln_jax.models.model import Model
-from dln_jax.models.rigid_tree import RigidTreeParameters, Rows, make_rigid_tree
+from dln_jax.models.trees import RigidTreeParameters, Rows, make_rigid_tree
 from dln_jax.types import FrictionLaw
 
 

@@ -24,7 +24,7 @@ from dln_jax.mechanics.friction.laws import FrictionShape, coefficients_of, requ
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.motors import Pair, motor_regressor, require_motors
 from dln_jax.mechanics.trees.recursions import regressor
-from dln_jax.models.rigid_tree import WARM, Rows
+from dln_jax.models.trees import WARM, Rows
 from dln_jax.solvers.separable import SeparableSolution, solve_separable
 from dln_jax.types import FrictionLaw, InputError
 

@@ -1,4 +1,4 @@
-"""Fits `models.trigonometric_kernel`: scales by maximum likelihood, weights by one linear solve.
+"""Fits `models.kernel`: scales by maximum likelihood, weights by one linear solve.
 
     tau = O L + Phi c + noise,   cov = K + Phi S² Phiᵀ + diag(noise²),   weights = cov⁻¹ tau,   c = S² Phiᵀ weights
 
@@ -22,8 +22,7 @@ from dln_jax.learning.select import Trial
 from dln_jax.mechanics.friction.curves import unit_force
 from dln_jax.mechanics.friction.laws import FrictionShape, coefficients_of
 from dln_jax.models.joint_friction import FrictionParameters
-from dln_jax.models.torque_covariance import States
-from dln_jax.models.trigonometric_kernel import KernelParameters, KernelScales
+from dln_jax.models.kernel import KernelParameters, KernelScales, States
 from dln_jax.types import InputError, Needs, require_positive
 from dln_jax.zoo.catalogue import CATALOGUE
 

@@ -1,4 +1,4 @@
-"""Fits the scales and noise of the energies of `models.trigonometric_kernel` by the marginal likelihood of torques.
+"""Fits the scales and noise of the energies of `models.kernel` by the marginal likelihood of torques.
 
     -log p = ½ tauᵀ cov⁻¹ tau + ½ log det cov + const,   cov = K + Phi S² Phiᵀ + diag(noise²)
 
@@ -19,8 +19,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.models.torque_covariance import States, torque_covariance
-from dln_jax.models.trigonometric_kernel import KernelScales
+from dln_jax.models.kernel import KernelScales, States, torque_covariance
 from dln_jax.types import JointKind, Needs
 
 FIRST_NOISE = 0.05

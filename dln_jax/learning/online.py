@@ -133,7 +133,7 @@ def make_linear_refit(model: Model, *, negligible: float = 1e-12) -> Refit:
     shortest solution, see `solvers.least_squares`).
 
     Args:
-        model: linear in its parameters, such as `models.planar_chain` or `models.rigid_tree`.
+        model: linear in its parameters, such as `models.trigonometric` or `models.trees`.
         negligible: as for `learning.linear.fit_linear`.
     """
     columns_of = design(model)

@@ -5,7 +5,6 @@ static, so the checks cost a compiled function nothing.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import jax
@@ -38,20 +37,6 @@ def vectors(size: int | None = None, /, **arguments: Any) -> tuple[Array, ...]:
         expected = array.shape
     common = jnp.result_type(float, *arrays.values())
     return tuple(array.astype(common) for array in arrays.values())
-
-
-@dataclass(frozen=True, eq=False)
-class OfSize:
-    """A function of vectors [size], which refuses other sizes."""
-
-    function: Callable[..., Any]
-    size: int
-
-    def __call__(self, *state: Array) -> Any:
-        """Returns the function's value; raises `InputError` for vectors of another size."""
-        for vector in state:
-            require_shape("a state of this model", vector.shape, (self.size,))
-        return self.function(*state)
 
 
 def require_size_of(energy: Callable[..., Any], size: int) -> None:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from dln_jax.mechanics.arguments import OfSize, require_size_of
+from dln_jax.mechanics.arguments import require_size_of
 from dln_jax.mechanics.dynamics import Dynamics, decompose_by_differences, make_dynamics
 from dln_jax.solvers.elimination import solve
 from dln_jax.types import Dissipation, Lagrangian, Matrix, Scalar, Vector
@@ -65,7 +65,8 @@ def dynamics(system: LagrangianSystem, *, degrees_of_freedom: int | None = None)
 
     def L(q: Vector, qd: Vector) -> Scalar:
         size = q.shape[0]
-        if size not in accepted and not isinstance(system.lagrangian, OfSize):
+        # Energies of models have a size, and refuse others themselves.
+        if size not in accepted and not hasattr(system.lagrangian, "size"):
             require_size_of(system.lagrangian, size)
             accepted.add(size)
         return system.lagrangian(q, qd)

@@ -22,7 +22,7 @@ from dln_jax.data.schema import momenta
 from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.integrators import adaptive_rollout
 from dln_jax.models.model import Model, Parameters
-from dln_jax.scenes.datasets.phase_samples import PhaseSamples
+from dln_jax.scenes.datasets.hamiltonian_tasks import PhaseSamples
 from dln_jax.types import Hamiltonian
 
 MOST_STEPS = 5_000

@@ -1,9 +1,10 @@
-"""Hamiltonian neural networks, structured, black-box and separable, and their dissipation.
+"""Hamiltonian neural networks, structured, black-box and separable, their dissipation, and bodies in pairs.
 
     structured:   H = ½ |L(q)ᵀ p|² + V(q),  M⁻¹ = L Lᵀ,  diag L = softplus(x + shift) + floor
     black-box:    H = network([features(q), p / momentum_scale])
     separable:    H = T(p / momentum_scale) + V(features(q)), with two networks
     dissipative:  D = ½ sum_j c_j(q) qd_j²,   c = softplus(network(features(q))) > 0,   dH/dt = -2 D <= 0
+    pairwise:     H = sum_i |p_i|² / (2 m_i) + sum over pairs of U(r_ij),   U(r) = w·f(r) + network(f(r))
 
 The black-box model is that of Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks". The structured one
 follows Lutter and Peters 2021, with a network for the inverse mass matrix, and the separable one Chen et al. 2020,
@@ -11,6 +12,18 @@ follows Lutter and Peters 2021, with a network for the inverse mass matrix, and 
 steps (`mechanics.integrators.stormer_verlet`) apply to it. It fits systems whose kinetic energy depends on p alone.
 
 `mechanics.equations.flow` turns all of them into Hamilton's equations, and `dynamics` into equations in velocities.
+
+In the pairwise model, q and p hold one body after the other, [bodies * dimension], or with `order="axes"` one axis
+after the other (x1, x2, .., y1, y2, ..), as in many published files. H depends only on distances: it is invariant under
+translation, rotation and reflection, so total momentum and angular momentum are conserved for any parameters. It is
+also invariant under exchange of identical bodies.
+
+The features f of r, in units of `distance_scale`, are r, 1/r and log r by default: the potentials of a constant force
+and of Newton's and Coulomb's law, in space and in the plane. Their linear term w·f is exact for these laws and does not
+saturate as bodies approach, unlike a bounded activation; the network learns the rest. To assume none of these laws,
+leave their features out.
+
+At r = 0 the energy (with 1/r or log r) and its derivative are not finite: there is no softening.
 """
 
 from collections.abc import Callable
@@ -19,26 +32,28 @@ from functools import partial
 import haiku as hk
 import jax
 import jax.numpy as jnp
-from jax import Array
+import numpy as np
 from jax.typing import DTypeLike
+from jaxtyping import Array, Float
 
 from dln_jax.mechanics.equations import Canonical
 from dln_jax.mechanics.hamiltonian import Guess, HamiltonianSystem
 from dln_jax.mechanics.natural import NaturalHamiltonian
-from dln_jax.models.lagrangian import black_box_terms, structured_terms
 from dln_jax.models.model import (
     Model,
     Parameters,
     Scale,
+    black_box_terms,
     joint_features,
     model_of,
     per_coordinate,
     perceptrons,
+    structured_terms,
     viscous_dissipation,
 )
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.sizes import require_network
-from dln_jax.types import Needs, Scalar, Vector, require_positive
+from dln_jax.types import InputError, Matrix, Needs, Scalar, Vector, require_positive
 
 
 def make_structured_hamiltonian(
@@ -178,3 +193,72 @@ def make_dissipative(
         return model.energies(parameters["energy"])._replace(dissipation=dissipation)
 
     return Model(init, energies)
+
+
+FEATURES = {"distance": lambda r: r, "inverse": lambda r: 1 / r, "logarithm": jnp.log}
+"""Functions of the distance that a pair energy may depend on."""
+
+
+def make_pairwise_hamiltonian(
+    needs: Needs,
+    *,
+    dimension: int = 2,
+    order: str = "bodies",
+    alike: bool = True,
+    features: tuple[str, ...] = ("distance", "inverse", "logarithm"),
+    distance_scale: float = 1.0,
+    width: int = 32,
+    depth: int = 2,
+    activation: Activation | str = tanh,
+    dtype: DTypeLike = jnp.float32,
+) -> Model:
+    """Returns the (init, energies) pair of bodies with learned masses and pair energies.
+
+    Args:
+        needs: prismatic coordinates of at least two bodies, without friction.
+        dimension: coordinates per body.
+        order: order of the coordinates, body by body (x1, y1, x2, y2) or axis by axis (x1, x2, y1, y2).
+        alike: whether all bodies share one mass and all pairs one energy; otherwise they have their own.
+        features: names from `FEATURES`.
+        distance_scale: typical distance in m; distances are divided by it.
+        width, depth, activation, dtype: as described in `models.model`.
+
+    Raises:
+        InputError: the needs do not fit, there are fewer than two bodies, a number is not positive, the order is
+            unknown, or features are unknown, repeated or missing.
+    """
+    require_positive(dimension=dimension, distance_scale=distance_scale)
+    networks = perceptrons(width, depth, activation)
+    has_friction = needs.friction or needs.joint_friction
+    if set(needs.joints) != {"prismatic"} or needs.degrees_of_freedom % dimension or has_friction:
+        raise InputError(
+            f"the pairwise model takes positions of bodies, {dimension} for each, without friction; it got {needs}"
+        )
+    if (bodies := needs.degrees_of_freedom // dimension) < 2:
+        raise InputError(f"bodies is {bodies}; expected at least 2, since the energy is one of pairs")
+    if order not in ("bodies", "axes"):
+        raise InputError(f"order is {order!r}; expected 'bodies' (x1, y1, x2, y2) or 'axes' (x1, x2, y1, y2)")
+    if not features or len(set(features)) < len(features) or not set(features) <= set(FEATURES):
+        raise InputError(f"features are {features}; expected some of {', '.join(FEATURES)}, each once")
+    first, second = np.triu_indices(bodies, 1)
+    # Rows subtract one body's position from another's.
+    difference = np.eye(bodies)[first] - np.eye(bodies)[second]
+    kinds = 1 if alike else len(difference)
+
+    def pair_energies(r: Float[Array, " pairs"]) -> Float[Array, "pairs kinds"]:
+        seen = jnp.stack([FEATURES[name](r / distance_scale) for name in features], axis=1)
+        return hk.Linear(kinds, with_bias=False, name="pair_linear")(seen) + networks("pair", kinds)(seen)
+
+    def potential(q: Vector) -> Scalar:
+        positions = q.reshape(bodies, dimension) if order == "bodies" else q.reshape(dimension, bodies).T
+        separation = jnp.matmul(jnp.asarray(difference, q.dtype), positions, precision="highest")
+        energies = pair_energies(jnp.sqrt(jnp.sum(separation**2, axis=1)))
+        return jnp.sum(energies) if alike else jnp.trace(energies)
+
+    def inverse_factor(q: Vector) -> Matrix:
+        logarithm = hk.get_parameter("log_mass", (1 if alike else bodies,), q.dtype, hk.initializers.Constant(0.0))
+        factors = jnp.exp(-0.5 * jnp.broadcast_to(logarithm, (bodies,)))
+        return jnp.diag(jnp.repeat(factors, dimension) if order == "bodies" else jnp.tile(factors, dimension))
+
+    terms = {"potential": potential, "inverse_factor": inverse_factor}
+    return model_of(NaturalHamiltonian, lambda: terms, needs.degrees_of_freedom, dtype)

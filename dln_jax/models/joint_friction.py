@@ -76,7 +76,7 @@ def with_joint_friction(
     def init(key: Array) -> Parameters:
         friction = FrictionParameters(
             {name: jnp.full(d, 0.0 if linear or name == "offset" else START, dtype) for name in coefficients_of(laws)},
-            {name: jnp.full(d, _shape_start(name, start), dtype) for name in learned}
+            {name: jnp.full(d, start.sigmoid_shift if name == "sigmoid_shift" else 0.0, dtype) for name in learned}
             | ({"load": jnp.full(d, START, dtype)} if "load" in laws else {}),
         )
         return {"model": model.init(key), "friction": friction}
@@ -106,7 +106,3 @@ def friction_of(
         if name != "load"
     }
     return FrictionCoefficients(**coefficients), start._replace(**shape)
-
-
-def _shape_start(name: str, start: FrictionShape) -> Any:
-    return start.sigmoid_shift if name == "sigmoid_shift" else 0.0

@@ -1,4 +1,15 @@
-"""The type of all models (parameters, and the energies that they define), and the parts that models share.
+"""The type of all models (parameters, and the energies that they define), and deep Lagrangian networks.
+
+    structured:  L = ½ qdᵀ M(q) qd - V(q),  M = L(q) L(q)ᵀ,  diag L = softplus(x + shift) + floor
+    black-box:   L = network([features(q), qd / rate_scale])
+
+The structured model (Lutter, Ritter and Peters 2019, "Deep Lagrangian Networks") has a network for the Cholesky factor
+of the mass matrix and another for the potential. Terms that the scene lacks are not built: no potential network without
+gravity, no dissipation without friction, no cos and sin for prismatic joints.
+
+The black-box model (Lutter and Peters 2021, "Combining physics and deep learning to learn continuous-time dynamics
+models", section on black-box models) has no structure. Its mass matrix d²L/dqd² is symmetric but may be indefinite:
+`metrics.errors` reports where it is.
 
 Factories share these keywords: `width` hidden units in each of the `depth` hidden layers of the model's networks; their
 `activation`, which must be smooth if forces are derivatives of an energy; the `dtype` of the parameters. `needs`
@@ -8,6 +19,7 @@ positive, and for scales that are neither one number nor one per coordinate.
 
 import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,19 +27,24 @@ import haiku as hk
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from dln_jax.mechanics.arguments import OfSize
+from dln_jax.mechanics.arguments import require_shape
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.nn.activations import Activation
+from dln_jax.mechanics.lagrangian import LagrangianSystem
+from dln_jax.mechanics.natural import NaturalSystem
+from dln_jax.nn.activations import Activation, tanh
 from dln_jax.nn.activations import activation as activation_of
 from dln_jax.sizes import require_network
-from dln_jax.types import InputError, Needs, Scalar, Vector, require_positive
+from dln_jax.types import InputError, Matrix, Needs, Scalar, Vector, require_positive
 
 Parameters = Any
 """A pytree of arrays."""
 Scale = float | tuple[float, ...]
 """Typical size of a quantity, in its unit: one number, or one per coordinate."""
+Networks = Callable[[str, int], hk.nets.MLP]
+"""(name, outputs) -> network, from `perceptrons`."""
 
 
 class Model(NamedTuple):
@@ -41,6 +58,69 @@ class Model(NamedTuple):
     """Random key -> parameters."""
     energies: Callable[[Parameters], Any]
     """Parameters -> a record of energies, one of `mechanics.equations.System`, as functions of one state."""
+
+
+@dataclass(frozen=True, eq=False)
+class OfSize:
+    """An energy of vectors [size], which refuses other sizes."""
+
+    function: Callable[..., Any]
+    size: int
+
+    def __call__(self, *state: Array) -> Any:
+        """Returns the energy; raises `InputError` for vectors of another size."""
+        for vector in state:
+            if vector.shape != (self.size,):
+                require_shape("a state of this model", vector.shape, (self.size,))
+        return self.function(*state)
+
+
+def make_delan(
+    needs: Needs,
+    *,
+    width: int = 64,
+    depth: int = 2,
+    activation: Activation | str = tanh,
+    diagonal_shift: float = 2.0,
+    diagonal_floor: float = 0.1,
+    shared_trunk: bool = False,
+    dtype: DTypeLike = jnp.float32,
+) -> Model:
+    """Returns the (init, energies) pair of a structured DeLaN.
+
+    Args:
+        diagonal_shift: added to the pre-activation of L's diagonal; sets the initial diagonal.
+        diagonal_floor: smallest diagonal element of L, in the square root of the unit of M; keeps M regular.
+        shared_trunk: whether factor and potential are outputs of one network instead of two.
+        needs, width, depth, activation, dtype: as described in `models.model`.
+    """
+    networks = perceptrons(width, depth, activation)
+    terms = partial(
+        structured_terms, needs, networks, "cholesky", diagonal_shift, diagonal_floor, shared_trunk=shared_trunk
+    )
+    return model_of(NaturalSystem, terms, needs.degrees_of_freedom, dtype)
+
+
+def make_black_box_lagrangian(
+    needs: Needs,
+    *,
+    width: int = 64,
+    depth: int = 2,
+    activation: Activation | str = tanh,
+    rate_scale: Scale = 1.0,
+    dtype: DTypeLike = jnp.float32,
+) -> Model:
+    """Returns the (init, energies) pair of a black-box Lagrangian: one network, so leaving out gravity saves nothing.
+
+    The activation needs curvature in qd, since M is the second derivative by qd.
+
+    Args:
+        rate_scale: typical size of qd; the network's input is divided by it.
+        needs, width, depth, activation, dtype: as described in `models.model`.
+    """
+    rates = per_coordinate(needs, "rate_scale", rate_scale)
+    terms = partial(black_box_terms, needs, perceptrons(width, depth, activation), "lagrangian", rates)
+    return model_of(LagrangianSystem, terms, needs.degrees_of_freedom, dtype)
 
 
 def model_of(
@@ -134,3 +214,43 @@ def per_coordinate(needs: Needs, name: str, scale: Scale) -> tuple[float, ...]:
     for size in sizes:
         require_positive(**{name: size})
     return sizes
+
+
+def cholesky_factor(entries: Float[Array, "entries"], d: int, *, shift: float, floor: float) -> Matrix:
+    """Returns lower triangular L [d, d]: diagonal softplus(entries[:d] + shift) + floor, the other entries below."""
+    diagonal = jax.nn.softplus(entries[:d] + shift) + floor
+    return jnp.diag(diagonal).at[np.tril_indices(d, -1)].set(entries[d:])
+
+
+def structured_terms(
+    needs: Needs, networks: Networks, factor: str, shift: float, floor: float, *, shared_trunk: bool = False
+) -> dict[str, Callable[..., Any] | None]:
+    """Returns L(q) under the name `factor`, and the potential and dissipation."""
+    d = len(needs.joints)
+    entries = d * (d + 1) // 2
+    shared = shared_trunk and needs.gravity
+    first = networks("energies", entries + 1) if shared else networks("cholesky", entries)
+    second = first if shared else networks("potential", 1)
+
+    def cholesky(q: Vector) -> Matrix:
+        return cholesky_factor(first(joint_features(needs, q))[:entries], d, shift=shift, floor=floor)
+
+    def potential(q: Vector) -> Scalar:
+        return second(joint_features(needs, q))[-1]
+
+    return {
+        factor: cholesky,
+        "potential": potential if needs.gravity else None,
+        "dissipation": viscous_dissipation if needs.friction else None,
+    }
+
+
+def black_box_terms(
+    needs: Needs, networks: Networks, name: str, sizes: tuple[float, ...]
+) -> dict[str, Callable[[Vector, Vector], Scalar] | None]:
+    """Returns the energy network([features(q), x / sizes]) -> scalar under `name`, and the dissipation."""
+
+    def energy(q: Vector, x: Vector) -> Scalar:
+        return networks(name, 1)(inputs_of(needs, q, (x, sizes)))[0]
+
+    return {name: energy, "dissipation": viscous_dissipation if needs.friction else None}

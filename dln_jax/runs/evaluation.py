@@ -29,9 +29,8 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction.curves import joint_dissipation
 from dln_jax.mechanics.trees.recursions import tree_system
 from dln_jax.metrics.coverage import LEVEL, coverage
-from dln_jax.metrics.definiteness import definiteness
-from dln_jax.metrics.errors import as_arrays, errors, mean_square, prediction_program, samples_of
-from dln_jax.metrics.rollouts import Motion, by_trajectory, metrics_of_motions, motion_program, records_of
+from dln_jax.metrics.errors import as_arrays, definiteness, errors, mean_square, prediction_program, samples_of
+from dln_jax.metrics.motions import Motion, by_trajectory, metrics_of_motions, motion_program, records_of
 from dln_jax.metrics.verdict import FAR_FROM_NOISE, HeldOut, Verdict, held_out, judge, verdict_metrics, worst
 from dln_jax.models.model import Model
 from dln_jax.models.uncertainty import Uncertainty, deviation_of_rows, exceeds, scores_of_rows

@@ -1,22 +1,15 @@
-"""Pendulums in the plane: a single and a double one, the arm and the robots of two links, and a chain of d rods."""
+"""Pendulums: a single and a double one, arms of two links, chains of d rods, and poles on a driven base."""
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.scenes.scene import Scene, no_coriolis, textbook
-from dln_jax.types import InputError, Matrix, Scalar, Vector
+from dln_jax.types import InputError, Matrix, Needs, Scalar, Vector
 
 LINK_LENGTH = 1.0
 """Length of both links in m."""
-
-# Inertial and gravity constants of the published plant, kg m² and N m.
-_SHOULDER_INERTIA = 1.3727291666666667
-_ELBOW_INERTIA = 0.5176145833333333
-_COUPLING = 0.5
-_SHOULDER_WEIGHT = 2.625
-_ELBOW_WEIGHT = 1.5
 
 
 def pendulum(*, mass: float = 1.0, length: float = 1.0, acceleration: float = 9.81, friction: float = 0.0) -> Scene:
@@ -81,34 +74,54 @@ def two_link_arm(*, zero: Literal["horizontal", "hanging"] = "horizontal") -> Sc
     `zero` is the posture at q = 0, which sets the gravity convention: "horizontal" is that of all published data
     (gravity in cos q), "hanging" that of most textbooks (gravity in sin q).
     """
+    name = "two-link-arm" if zero == "horizontal" else "two-link-arm-hanging"
+    inertias, weights = (1.3727291666666667, 0.5176145833333333, 0.5), (2.625, 1.5)
+    return _two_links(name, inertias, weights, (LINK_LENGTH, LINK_LENGTH), hanging=zero == "hanging")
+
+
+def _two_links(
+    name: str,
+    inertias: tuple[float, float, float],
+    weights: tuple[float, float],
+    lengths: tuple[float, float],
+    *,
+    hanging: bool,
+    **options: Any,
+) -> Scene:
+    """Returns two links in a plane, q[1] relative to the first one.
+
+    Args:
+        inertias: M = [[a + 2 c cos q2, b + c cos q2], [b + c cos q2, b]] with these a, b and c, kg m².
+        weights: torque that holds each link horizontal, N m; that of the first carries the second.
+        hanging: whether both links hang at q = 0, or are horizontal.
+        options: friction and actuation, as for `textbook`.
+    """
+    shoulder_inertia, elbow_inertia, coupling = inertias
     # The conventions differ by a quarter turn.
-    if zero == "horizontal":
-        name, offset, rise, slope = "two-link-arm", 0.0, jnp.sin, jnp.cos
-    else:
-        name, offset, rise, slope = "two-link-arm-hanging", -jnp.pi / 2, lambda angle: -jnp.cos(angle), jnp.sin
+    offset, rise, slope = (-jnp.pi / 2, lambda x: -jnp.cos(x), jnp.sin) if hanging else (0.0, jnp.sin, jnp.cos)
 
     def mass_matrix(q: Vector) -> Matrix:
-        cosine = jnp.cos(q[1])
-        shoulder = _SHOULDER_INERTIA + 2 * _COUPLING * cosine
-        coupling = _ELBOW_INERTIA + _COUPLING * cosine
-        return jnp.array([[shoulder, coupling], [coupling, _ELBOW_INERTIA]])
+        cosine = coupling * jnp.cos(q[1])
+        across = elbow_inertia + cosine
+        return jnp.array([[shoulder_inertia + 2 * cosine, across], [across, elbow_inertia]])
 
     def coriolis(q: Vector, qd: Vector) -> Vector:
-        sine = _COUPLING * jnp.sin(q[1])
+        sine = coupling * jnp.sin(q[1])
         return jnp.array([-sine * (2 * qd[0] * qd[1] + qd[1] ** 2), sine * qd[0] ** 2])
 
     def potential(q: Vector) -> Scalar:
-        return _SHOULDER_WEIGHT * rise(q[0]) + _ELBOW_WEIGHT * rise(q[0] + q[1])
+        return weights[0] * rise(q[0]) + weights[1] * rise(q[0] + q[1])
 
     def gravity(q: Vector) -> Vector:
-        elbow = _ELBOW_WEIGHT * slope(q[0] + q[1])
-        return jnp.array([_SHOULDER_WEIGHT * slope(q[0]) + elbow, elbow])
+        elbow = weights[1] * slope(q[0] + q[1])
+        return jnp.array([weights[0] * slope(q[0]) + elbow, elbow])
 
     def tip(q: Vector) -> Vector:
-        angles = jnp.array([q[0], q[0] + q[1]]) + offset
-        return LINK_LENGTH * jnp.array([jnp.sum(jnp.cos(angles)), jnp.sum(jnp.sin(angles))])
+        rods, angles = jnp.array(lengths), jnp.array([q[0], q[0] + q[1]]) + offset
+        return jnp.array([rods @ jnp.cos(angles), rods @ jnp.sin(angles)])
 
-    return textbook(name, ("revolute", "revolute"), mass_matrix, coriolis, potential, gravity, tip)
+    joints = ("revolute", "revolute")
+    return textbook(name, joints, mass_matrix, coriolis, potential, gravity, tip, **options)
 
 
 def joint_angles(tip: Vector) -> Vector:
@@ -148,31 +161,10 @@ def two_link_pendulum(
     The default links are those of design C.1, model 1.1, of the benchmark of Wiebe et al. (2022, "RealAIGym").
     """
     (m1, m2), (l1, l2), (r1, r2), (I1, I2) = links
-    coupling = m2 * l1 * r2
-    inner, outer = (m1 * r1 + m2 * l1) * acceleration, m2 * r2 * acceleration
-
-    def mass_matrix(q: Vector) -> Matrix:
-        c = coupling * jnp.cos(q[1])
-        return jnp.array([[I1 + I2 + m2 * l1**2 + 2 * c, I2 + c], [I2 + c, jnp.full_like(c, I2)]])
-
-    def coriolis(q: Vector, qd: Vector) -> Vector:
-        s = coupling * jnp.sin(q[1])
-        return jnp.array([-s * qd[1] * (2 * qd[0] + qd[1]), s * qd[0] ** 2])
-
-    def potential(q: Vector) -> Scalar:
-        return -inner * jnp.cos(q[0]) - outer * jnp.cos(q[0] + q[1])
-
-    def gravity(q: Vector) -> Vector:
-        both = outer * jnp.sin(q[0] + q[1])
-        return jnp.array([inner * jnp.sin(q[0]) + both, both])
-
-    def tip(q: Vector) -> Vector:
-        both = q[0] + q[1]
-        return jnp.array([l1 * jnp.sin(q[0]) + l2 * jnp.sin(both), -l1 * jnp.cos(q[0]) - l2 * jnp.cos(both)])
-
+    inertias = I1 + I2 + m2 * l1**2, I2, m2 * l1 * r2
+    weights = (m1 * r1 + m2 * l1) * acceleration, m2 * r2 * acceleration
     name, actuation = {"elbow": ("acrobot", ((0.0,), (1.0,))), "shoulder": ("pendubot", ((1.0,), (0.0,)))}[motor]
-    equations = mass_matrix, coriolis, potential, gravity, tip
-    return textbook(name, ("revolute", "revolute"), *equations, friction=friction, actuation=actuation)
+    return _two_links(name, inertias, weights, (l1, l2), hanging=True, friction=friction, actuation=actuation)
 
 
 def chain(
@@ -219,3 +211,135 @@ def chain(
 def _sum_outwards(forces):
     """Multiplies the rows by Sᵀ: a joint's torque is the sum over its own rod and all rods beyond it."""
     return jnp.cumsum(forces[::-1], axis=0)[::-1]
+
+
+def cart_pole(
+    *,
+    cart_mass: float = 1.0,
+    pole_mass: float = 0.1,
+    length: float = 0.5,
+    acceleration: float = 9.81,
+    friction: float = 0.0,
+) -> Scene:
+    """A driven cart with a free pole, q = (cart position, pole angle from upright); in kg, m, m/s², N s/m and N m s.
+
+    The pole is a point mass at `length` from its hinge. Only the cart is driven: tau = B f with B = (1, 0)ᵀ.
+    """
+    coupling = pole_mass * length
+    weight = coupling * acceleration
+
+    def mass_matrix(q: Vector) -> Matrix:
+        off_diagonal = coupling * jnp.cos(q[1])
+        return jnp.array([[cart_mass + pole_mass, off_diagonal], [off_diagonal, pole_mass * length**2]])
+
+    def coriolis(q: Vector, qd: Vector) -> Vector:
+        return jnp.array([-coupling * jnp.sin(q[1]) * qd[1] ** 2, 0.0])
+
+    def potential(q: Vector) -> Scalar:
+        return weight * jnp.cos(q[1])
+
+    def gravity(q: Vector) -> Vector:
+        return jnp.array([0.0, -weight * jnp.sin(q[1])])
+
+    def tip(q: Vector) -> Vector:
+        return jnp.array([q[0] + length * jnp.sin(q[1]), length * jnp.cos(q[1])])
+
+    equations = mass_matrix, coriolis, potential, gravity, tip
+    return textbook("cart-pole", ("prismatic", "revolute"), *equations, friction=friction, actuation=((1.0,), (0.0,)))
+
+
+def flexible_cart_pole(
+    *,
+    driven_mass: float = 0.57,
+    carried_mass: float = 0.375,
+    pole_mass: float = 0.127,
+    length: float = 0.1778,
+    stiffness: float = 200.0,
+    acceleration: float = 9.81,
+    friction: tuple[float, float, float] = (0.5, 0.5, 0.0024),
+) -> Scene:
+    """A cart pulls a second one by a spring, q = (driven cart, extension of the spring, pole angle from upright).
+
+    The second cart is at q[0] + q[1]; it carries the pole, a point mass at `length` from its hinge. Only the first cart
+    is driven: tau = B f with B = (1, 0, 0)ᵀ. Defaults are those of Lutter et al. (CoRL 2019).
+
+    Args:
+        driven_mass: mass of the driven cart, kg.
+        carried_mass: mass of the second cart, kg.
+        pole_mass: mass of the pole, kg.
+        length: distance of the pole's mass from its hinge, m.
+        stiffness: stiffness of the spring, N/m.
+        acceleration: m/s².
+        friction: viscous friction of the two carts on the rail, N s/m, and of the hinge, N m s.
+    """
+    coupling = pole_mass * length
+    weight = coupling * acceleration
+    beyond = carried_mass + pole_mass
+
+    def mass_matrix(q: Vector) -> Matrix:
+        across = coupling * jnp.cos(q[2])
+        return jnp.array(
+            [[driven_mass + beyond, beyond, across], [beyond, beyond, across], [across, across, pole_mass * length**2]]
+        )
+
+    def coriolis(q: Vector, qd: Vector) -> Vector:
+        pull = -coupling * jnp.sin(q[2]) * qd[2] ** 2
+        return jnp.array([pull, pull, 0.0])
+
+    def potential(q: Vector) -> Scalar:
+        return 0.5 * stiffness * q[1] ** 2 + weight * jnp.cos(q[2])
+
+    def gravity(q: Vector) -> Vector:
+        return jnp.array([0.0, stiffness * q[1], -weight * jnp.sin(q[2])])
+
+    def dissipation(q: Vector, qd: Vector) -> Scalar:
+        first, second, hinge = friction
+        return 0.5 * (first * qd[0] ** 2 + second * (qd[0] + qd[1]) ** 2 + hinge * qd[2] ** 2)
+
+    def tip(q: Vector) -> Vector:
+        return jnp.array([q[0] + q[1] + length * jnp.sin(q[2]), length * jnp.cos(q[2])])
+
+    joints, damped = ("prismatic", "prismatic", "revolute"), dissipation if any(friction) else None
+    needs = Needs(joints=joints, friction=any(friction), actuation=((1.0,), (0.0,), (0.0,)))
+    return Scene("flexible-cart-pole", needs, mass_matrix, coriolis, potential, gravity, damped, tip)
+
+
+def rotary_pendulum(
+    *,
+    arm_mass: float = 0.095,
+    arm_length: float = 0.085,
+    pole_mass: float = 0.024,
+    pole_length: float = 0.129,
+    acceleration: float = 9.81,
+    friction: float = 0.0,
+) -> Scene:
+    """An arm about the vertical carries a free pole, q = (arm angle, pole angle from upright); kg, m, m/s², N m s.
+
+    After Furuta et al. (1992). Arm and pole are uniform rods. Only the arm is driven: tau = B u with B = (1, 0)ᵀ. The
+    dimensions are those of a common desktop plant.
+    """
+    centre = pole_length / 2
+    about_hinge = pole_mass * pole_length**2 / 3
+    arm_inertia = arm_mass * arm_length**2 / 3 + pole_mass * arm_length**2
+    coupling = pole_mass * arm_length * centre
+    weight = pole_mass * acceleration * centre
+
+    def mass_matrix(q: Vector) -> Matrix:
+        off_diagonal = coupling * jnp.cos(q[1])
+        return jnp.array([[arm_inertia + about_hinge * jnp.sin(q[1]) ** 2, off_diagonal], [off_diagonal, about_hinge]])
+
+    def coriolis(q: Vector, qd: Vector) -> Vector:
+        turning = about_hinge * jnp.sin(2 * q[1])
+        return jnp.array([turning * qd[0] * qd[1] - coupling * jnp.sin(q[1]) * qd[1] ** 2, -0.5 * turning * qd[0] ** 2])
+
+    def potential(q: Vector) -> Scalar:
+        return weight * jnp.cos(q[1])
+
+    def gravity(q: Vector) -> Vector:
+        return jnp.array([0.0, -weight * jnp.sin(q[1])])
+
+    def tip(q: Vector) -> Vector:
+        return pole_length * jnp.array([jnp.sin(q[1]), jnp.cos(q[1])])
+
+    equations, actuation = (mass_matrix, coriolis, potential, gravity, tip), ((1.0,), (0.0,))
+    return textbook("rotary-pendulum", ("revolute", "revolute"), *equations, friction=friction, actuation=actuation)

@@ -3,8 +3,16 @@
 from collections.abc import Callable
 
 from dln_jax.scenes.particles import henon_heiles, mass_spring, n_body
-from dln_jax.scenes.pendulums import chain, double_pendulum, pendulum, two_link_arm, two_link_pendulum
-from dln_jax.scenes.poles import cart_pole, flexible_cart_pole, rotary_pendulum
+from dln_jax.scenes.pendulums import (
+    cart_pole,
+    chain,
+    double_pendulum,
+    flexible_cart_pole,
+    pendulum,
+    rotary_pendulum,
+    two_link_arm,
+    two_link_pendulum,
+)
 from dln_jax.scenes.scene import Scene
 from dln_jax.types import InputError
 

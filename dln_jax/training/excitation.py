@@ -9,7 +9,7 @@ import numpy as np
 from dln_jax.data import schema
 from dln_jax.data.csv_tables import write_motion
 from dln_jax.data.robots import Robot, read_robot
-from dln_jax.figures.joints import excitation_figure
+from dln_jax.figures.torques import excitation_figure
 from dln_jax.files import write_figure, write_json
 from dln_jax.identification.excitation.candidates import Design, random_designs
 from dln_jax.identification.excitation.design import CRITERIA, as_trajectories, design_set, error_ratio, together
@@ -19,7 +19,7 @@ from dln_jax.identification.excitation.task import Task, make_task
 from dln_jax.mechanics.trees.description import with_payload
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.models.model import Model, Parameters
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.trees import make_rigid_tree
 from dln_jax.runs.arguments import numbers_of
 from dln_jax.runs.progress import progress
 from dln_jax.runs.report import print_numbers

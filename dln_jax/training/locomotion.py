@@ -12,7 +12,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from dln_jax.figures import style
-from dln_jax.figures.soft_body_animations import write_soft_body_gif
+from dln_jax.figures.soft_bodies import write_soft_body_gif
 from dln_jax.files import write_figure, write_json
 from dln_jax.locomotion.gradient import Report, TrainedPolicies, settings_of, shown_walk, train
 from dln_jax.locomotion.learning import LANES, Goal, Record, evaluation_steps

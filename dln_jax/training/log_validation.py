@@ -13,7 +13,7 @@ from dln_jax.data.splits import with_joints
 from dln_jax.figures.logs import log_figure
 from dln_jax.files import write_bytes, write_figure, write_json
 from dln_jax.runs.arguments import names_listed, refuse_given
-from dln_jax.runs.encoders import facts
+from dln_jax.runs.logs import facts
 from dln_jax.runs.stored_arguments import command_folder
 from dln_jax.types import InputError
 

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure
-from dln_jax.figures.soft_body_animations import write_soft_body_gif
+from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure, write_soft_body_gif
 from dln_jax.files import write_figure
 from dln_jax.metrics.report import Row
 from dln_jax.metrics.soft_body_energies import motion_energies

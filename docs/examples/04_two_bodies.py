@@ -18,7 +18,7 @@ from dln_jax.figures import style
 from dln_jax.learning.rates import problem
 from dln_jax.mechanics import equations
 from dln_jax.mechanics.integrators import gauss_legendre4, rollout
-from dln_jax.models.n_body import make_pairwise_hamiltonian
+from dln_jax.models.hamiltonian import make_pairwise_hamiltonian
 from dln_jax.nn.activations import tanh
 from dln_jax.scenes.datasets.hamiltonian_tasks import two_body
 

@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from dln_jax.figures import style
-from dln_jax.figures.soft_body_animations import soft_body_frame
+from dln_jax.figures.soft_bodies import soft_body_drawing
 from dln_jax.locomotion.gradient import shown_walk, train
 from dln_jax.locomotion.learning import Goal
 from dln_jax.locomotion.task import creature_named, make_task
@@ -54,9 +54,11 @@ assert trained.best.distance > 1.0
 seen = shown_walk(task, trained.policy, trained.best.parameters, task.episode)
 assert seen.converged.all()
 moment = int(np.asarray(seen.actuation).std(axis=1).argmax())
-frame = soft_body_frame(
-    task.creature.mesh, np.asarray(seen.x[moment]), muscles=task.creature.muscles, actuation=seen.actuation[moment]
+muscles, lengths = task.creature.muscles, seen.actuation[moment : moment + 1]
+frame, draw = soft_body_drawing(
+    task.creature.mesh, np.asarray(seen.x[moment : moment + 1]), muscles=muscles, actuation=lengths
 )
+draw(0)
 
 # %%
 # The second figure shows its mean position, and the lengths of all muscles over time.

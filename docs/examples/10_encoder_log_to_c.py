@@ -26,7 +26,7 @@ from dln_jax.learning.friction import fit_friction
 from dln_jax.mechanics.trees.description import dh_frames, serial
 from dln_jax.mechanics.trees.frames import world_frames
 from dln_jax.mechanics.trees.inertia import inertial_parameters
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.trees import make_rigid_tree
 from dln_jax.models.uncertainty import predictive
 
 jax.config.update("jax_enable_x64", True)

@@ -20,9 +20,8 @@ from dln_jax.control.energy_shaping import EnergyGains, energy_shaping, parts_of
 from dln_jax.control.regulators import lqr, region_of_attraction, regulated, switched, value
 from dln_jax.control.state_space import error, field_of, holding_controls, linearise
 from dln_jax.figures import style
-from dln_jax.figures.closed_loop_animations import rotary_pendulum_drawing, write_closed_loop_gif
-from dln_jax.figures.closed_loops import phase_portrait
-from dln_jax.scenes.poles import rotary_pendulum
+from dln_jax.figures.closed_loops import rotary_pendulum_drawing, write_closed_loop_gif
+from dln_jax.scenes.pendulums import rotary_pendulum
 
 jax.config.update("jax_enable_x64", True)
 
@@ -94,19 +93,28 @@ write_closed_loop_gif(
 print(f"the film is in {folder}")
 
 # %%
-# Grey levels show the pole's energy with the arm at rest. On the dashed level the pole comes up by itself.
+# Grey levels show the pole's energy with the arm at rest. On the dashed level the pole comes up by itself. The
+# regulator takes over in the green ellipse.
 
 angles, rates = np.linspace(-np.pi, np.pi, 121), np.linspace(-30, 30, 101)
 resting = jax.vmap(lambda angle, rate: plant.energy(jnp.array([0.0, angle]), jnp.array([0.0, rate])))
 states = [grid.ravel() for grid in np.meshgrid(angles, rates)]
 levels = np.asarray(jax.jit(resting)(*states)).reshape(len(rates), len(angles))
-portrait = phase_portrait(
-    runs.x[:, :, 1],
-    runs.x[:, :, 3],
-    energy=(angles, rates, levels),
-    goal_energy=float(plant.energy(goal[:2], goal[2:])),
-    caught=(regulator.S[1::2, 1::2], region.level),
-)
+sizes, directions = np.linalg.eigh(np.asarray(regulator.S[1::2, 1::2]))
+turn = np.linspace(0, 2 * np.pi, 100)
+caught = directions @ (np.sqrt(region.level / sizes)[:, None] * np.stack([np.cos(turn), np.sin(turn)]))
+pole, speed = np.asarray(runs.x[:, :, 1]), np.asarray(runs.x[:, :, 3])
+pole = np.arctan2(np.sin(pole), np.cos(pole))
+jumps = np.abs(np.diff(pole, axis=1, prepend=pole[:, :1])) > np.pi  # where the wrapped angle leaps by a full turn
+portrait, axis = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
+axis.contourf(angles, rates, levels, levels=18, cmap="Greys", alpha=0.35)
+upright = [float(plant.energy(goal[:2], goal[2:]))]
+axis.contour(angles, rates, levels, levels=upright, colors="0.25", linestyles="--", linewidths=1.2)
+axis.plot(np.where(jumps, np.nan, pole)[1:].T, speed[1:].T, color=style.SKY, linewidth=0.7, alpha=0.6)
+axis.plot(np.where(jumps, np.nan, pole)[0], speed[0], color=style.BLUE, linewidth=1.8)
+axis.plot(pole[:, 0], speed[:, 0], "o", color=style.BLUE, markersize=3)
+axis.fill(*caught, color=style.GREEN, alpha=0.45, zorder=4)
+axis.set(xlim=(-np.pi, np.pi), xlabel="angle from upright, rad", ylabel="rate, rad/s")
 
 # %%
 # The last figure shows angles and torques over time, for all starts.

@@ -18,7 +18,7 @@ from dln_jax.control.state_space import field_of, integrated, linearise
 from dln_jax.control.trajectories import TrajectoryProblem
 from dln_jax.figures import style
 from dln_jax.mechanics.integrators import CLASSICAL, RADAU_3
-from dln_jax.scenes.poles import flexible_cart_pole
+from dln_jax.scenes.pendulums import flexible_cart_pole
 
 jax.config.update("jax_enable_x64", True)
 

@@ -10,6 +10,8 @@ fingers.
    :alt: Two fingers bend under pressure, close around a ball and lift it
 
    The film that this example writes, at 30 % of the speed.
+
+The drawing of the film is in `slab_films.py`, which lies in the folder of this example.
 """
 
 from pathlib import Path
@@ -19,9 +21,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import LinearSegmentedColormap, to_rgb
+from slab_films import TOOL, Slab, write_slab_film
 
 from dln_jax.figures import style
-from dln_jax.figures.soft_body_films import TOOL, Slab, write_slab_film
 from dln_jax.rollout import rollout
 from dln_jax.softbody.contact.bodies import body_contact
 from dln_jax.softbody.contact.crossings import crossings

@@ -9,6 +9,8 @@ keep the body away from the stairs and from itself.
    :alt: A soft ellipse tumbles down stairs
 
    The film that this example writes, at a third of the speed.
+
+The drawing of the film is in `slab_films.py`, which lies in the folder of this example.
 """
 
 from functools import partial
@@ -19,9 +21,9 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import PolyCollection
+from slab_films import write_slab_film
 
 from dln_jax.figures import style
-from dln_jax.figures.soft_body_films import write_slab_film
 from dln_jax.rollout import rollout
 from dln_jax.softbody.contact.bodies import body_contact
 from dln_jax.softbody.contact.crossings import crossings

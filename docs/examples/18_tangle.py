@@ -9,6 +9,8 @@ themselves. The example checks this in exact arithmetic.
    :alt: Five soft strips fall into a bin and fold into a heap
 
    The film that this example writes, at 40 % of the speed.
+
+The drawing of the film is in `slab_films.py`, which lies in the folder of this example.
 """
 
 from functools import partial
@@ -18,8 +20,8 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import PolyCollection
+from slab_films import write_slab_film
 
-from dln_jax.figures.soft_body_films import write_slab_film
 from dln_jax.rollout import rollout
 from dln_jax.softbody.contact.bodies import body_contact
 from dln_jax.softbody.contact.crossings import crossings

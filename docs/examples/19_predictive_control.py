@@ -26,8 +26,8 @@ from dln_jax.control.regulators import lqr, regulated, value
 from dln_jax.control.state_space import field_of, integrated, linearise
 from dln_jax.control.trajectories import TrajectoryProblem, first_plan
 from dln_jax.figures import style
-from dln_jax.figures.closed_loop_animations import cart_pole_drawing, write_closed_loop_gif
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.figures.closed_loops import cart_pole_drawing, write_closed_loop_gif
+from dln_jax.scenes.pendulums import cart_pole
 
 jax.config.update("jax_enable_x64", True)
 

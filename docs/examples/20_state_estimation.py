@@ -22,7 +22,7 @@ from dln_jax.control.observers import with_differences
 from dln_jax.control.regulators import lqr, regulated
 from dln_jax.control.state_space import field_of, linearise
 from dln_jax.figures import style
-from dln_jax.scenes.poles import rotary_pendulum
+from dln_jax.scenes.pendulums import rotary_pendulum
 
 jax.config.update("jax_enable_x64", True)
 

@@ -17,7 +17,7 @@ import dln_jax
 from dln_jax.control.closed_loop import Controller, Hardware, delivered, measured, simulate
 from dln_jax.control.state_space import field_of, integrated
 from dln_jax.figures import style
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole
 
 jax.config.update("jax_enable_x64", True)
 

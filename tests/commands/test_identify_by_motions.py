@@ -13,7 +13,7 @@ from dln_jax.identification.equations import columns_of, flat
 from dln_jax.identification.identify import parameters_of
 from dln_jax.identification.motions import cut_motions, fit_motions, linearise
 from dln_jax.learning.measured_motions import motion
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.trees import make_rigid_tree
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 URDF = """<robot name="pendulum"><link name="base"/><link name="rod"><inertial><origin xyz="0 0 -0.2"/><mass value="1"/>

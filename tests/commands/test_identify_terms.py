@@ -11,7 +11,7 @@ from small_logs import small_log
 from dln_jax import dynamics, load, load_c, read_robot
 from dln_jax.commands import identify
 from dln_jax.export.c.run import export_run
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.trees import make_rigid_tree
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 MJCF = """<mujoco><worldbody>

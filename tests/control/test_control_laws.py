@@ -15,7 +15,7 @@ from dln_jax.control.trajectories import TrajectoryProblem, first_plan
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.poles import rotary_pendulum
+from dln_jax.scenes.pendulums import rotary_pendulum
 
 SCENE = rotary_pendulum(friction=1e-5)
 PLANT = dynamics(SCENE.closed_form)

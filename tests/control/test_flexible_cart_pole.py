@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 from dln_jax.control.state_space import field_of, linearise
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.poles import flexible_cart_pole
+from dln_jax.scenes.pendulums import flexible_cart_pole
 
 SCENE = flexible_cart_pole()
 B = np.asarray(SCENE.needs.actuation)

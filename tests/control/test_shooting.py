@@ -16,7 +16,7 @@ from dln_jax.control.state_space import field_of, integrated
 from dln_jax.control.trajectories import TrajectoryProblem, first_plan
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import GAUSS_LEGENDRE_4, MIDPOINT, RADAU_3
-from dln_jax.scenes.poles import cart_pole, flexible_cart_pole
+from dln_jax.scenes.pendulums import cart_pole, flexible_cart_pole
 from dln_jax.solvers.ending import reason
 
 RANDOM = np.random.default_rng(0)

@@ -11,8 +11,7 @@ from dln_jax.control.regulators import lqr, region_of_attraction, regulated
 from dln_jax.control.state_space import field_of, holding_controls, linearise
 from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.pendulums import two_link_pendulum
-from dln_jax.scenes.poles import cart_pole, rotary_pendulum
+from dln_jax.scenes.pendulums import cart_pole, rotary_pendulum, two_link_pendulum
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from published_motions import published_arrays
 
 from dln_jax import Needs, flow
 from dln_jax.data.bodies import Bodies, find_bodies, imbalance
-from dln_jax.models.n_body import make_pairwise_hamiltonian
+from dln_jax.models.hamiltonian import make_pairwise_hamiltonian
 
 
 def by_body(x, count):

@@ -11,8 +11,7 @@ from dln_jax.data import schema
 from dln_jax.data.splits import PER_SAMPLE, merged, select, split
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.pendulums import pendulum, two_link_arm
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole, pendulum, two_link_arm
 
 
 def arrays(samples=12, d=2, trajectories=3):

@@ -6,8 +6,7 @@ from numpy.testing import assert_array_equal
 
 from dln_jax.data.repeated_motions import motion_numbers, remark_on_repeats
 from dln_jax.data.schema import from_arrays
-from dln_jax.data.splits import hold_out, in_blocks, split
-from dln_jax.data.stated_tests import stated_test
+from dln_jax.data.splits import hold_out, in_blocks, split, stated_test
 from dln_jax.training.hamiltonian.measurements import parted
 
 

@@ -2,13 +2,17 @@
 
 import numpy as np
 from calls import one_line
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from dln_jax.control.closed_loop import ClosedLoopRun
-from dln_jax.figures.closed_loop_animations import cart_pole_drawing, rotary_pendulum_drawing, write_closed_loop_gif
-from dln_jax.figures.closed_loops import closed_loop_traces, phase_portrait
-from dln_jax.figures.joints import friction_curves
+from dln_jax.figures.closed_loops import (
+    cart_pole_drawing,
+    closed_loop_traces,
+    rotary_pendulum_drawing,
+    write_closed_loop_gif,
+)
+from dln_jax.figures.torques import friction_curves
 
 T = np.linspace(0, 1, 51)
 Q = np.stack([0.1 * np.sin(3 * T), np.pi * (1 - T)], axis=1)
@@ -28,14 +32,6 @@ def test_traces_show_every_coordinate_and_the_limits():
     assert np.isfinite(energy.lines[0].get_ydata()).all()
     with one_line(r"expected \[K, T, 2 d\]"):
         closed_loop_traces(runs, ("revolute",))
-
-
-def test_the_portrait_goes_round_and_fills_what_is_caught():
-    angles = np.linspace(0, 4 * np.pi, 200)[None]
-    (axis,) = phase_portrait(angles, np.cos(angles), caught=(np.diag([4.0, 1.0]), 1.0)).axes
-    drawn = np.asarray(axis.lines[0].get_xdata())
-    assert np.isnan(drawn).sum() == 2 and np.nanmax(np.abs(drawn)) <= np.pi
-    assert_allclose(axis.patches[0].get_xy().max(axis=0), [0.5, 1.0], rtol=1e-2)
 
 
 def test_a_film_is_as_long_as_its_run(tmp_path):

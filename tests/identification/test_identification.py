@@ -20,7 +20,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees.description import serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters, pseudo_inertia
 from dln_jax.models.residual import make_residual
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.trees import make_rigid_tree
 from tests.calls import one_line
 
 MODEL = make_rigid_tree(ARM, friction=True)

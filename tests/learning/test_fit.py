@@ -16,7 +16,7 @@ from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.engine.problem import Problem, Stop, loss_of
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole
 
 X = jnp.linspace(-1, 1, 50)
 LINE = (X, 3 * X - 1)

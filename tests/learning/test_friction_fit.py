@@ -15,7 +15,7 @@ from dln_jax.learning.friction_selection import choose_terms
 from dln_jax.learning.friction_terms import terms_of
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction.laws import FrictionShape
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.trees import make_rigid_tree
 
 # Axes at a right angle: in a plane the second link's inertia is a coupling.
 ARM = PLANAR._replace(rotations=np.array([np.eye(3), [[1, 0, 0], [0, 0, 1], [0, -1, 0]]]))

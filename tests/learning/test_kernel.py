@@ -10,7 +10,7 @@ from dln_jax.data.splits import select
 from dln_jax.learning.kernel import fit_kernel
 from dln_jax.learning.marginal_likelihood import TorqueEquations, Unknowns, likelihood, start_of
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.models.torque_covariance import States
+from dln_jax.models.kernel import States
 from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.pendulums import pendulum, two_link_arm
 from dln_jax.zoo.catalogue import CATALOGUE

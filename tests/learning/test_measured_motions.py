@@ -12,7 +12,7 @@ from dln_jax.data.encoders.smoothing import smooth_locally
 from dln_jax.learning import measured_motions
 from dln_jax.learning.measured_motions import Gauge, Noise, cut_measured_windows, motion
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.models.planar_chain import make_planar_chain
+from dln_jax.models.trigonometric import make_planar_chain
 from dln_jax.types import Needs
 
 NEEDS = Needs(joints=("revolute", "revolute"), friction=True)

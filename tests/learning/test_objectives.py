@@ -13,7 +13,7 @@ from dln_jax.learning.engine.problem import loss_of
 from dln_jax.learning.objectives import BOTH_WAYS, STATED, arrays, objective_of, residuals
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.datasets.generators import uniform
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole
 from dln_jax.zoo.descriptions import build, describe_for
 
 ENERGIES = ("structured-delan", "black-box-hnn", "trigonometric")

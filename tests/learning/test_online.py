@@ -15,8 +15,8 @@ from dln_jax.learning.online import (
     make_refit,
 )
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.models.lagrangian import make_delan
-from dln_jax.models.planar_chain import make_planar_chain
+from dln_jax.models.model import make_delan
+from dln_jax.models.trigonometric import make_planar_chain
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import two_link_arm
 

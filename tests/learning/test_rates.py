@@ -16,7 +16,7 @@ from dln_jax.models.baselines import make_phase_network
 from dln_jax.models.hamiltonian import make_dissipative, make_separable_hamiltonian
 from dln_jax.models.model import Model
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
-from dln_jax.scenes.datasets import hamiltonian_tasks, phase_samples
+from dln_jax.scenes.datasets import hamiltonian_tasks
 from dln_jax.types import Needs
 from tests.models.random_parameters import drawn
 
@@ -29,7 +29,7 @@ FRICTION = {"friction_width": 4, "dtype": jnp.float64}
 def swing():
     """The pendulum without noise."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(phase_samples, "reference_motion", quick_motion)
+        patch.setattr(hamiltonian_tasks, "reference_motion", quick_motion)
         return hamiltonian_tasks.pendulum(0, trajectories=6, noise=0.0)
 
 

@@ -15,7 +15,7 @@ from dln_jax.learning.uncertainty import calibration, effective_samples, estimat
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.coverage import coverage
 from dln_jax.models.model import linearised
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.trees import make_rigid_tree
 from dln_jax.models.uncertainty import out_of_distribution, predictive, scores
 
 ARM = make_rigid_tree(TREE, friction=True, velocity_scale=0.1)

@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 from PIL import Image
 
 from dln_jax.commands import train_locomotion
-from dln_jax.figures.soft_body_animations import write_soft_body_gif
+from dln_jax.figures.soft_bodies import write_soft_body_gif
 from dln_jax.locomotion import gradient
 from dln_jax.locomotion.environment import CreatureEnvironment
 from dln_jax.locomotion.frames import axes_of, fitted_frame, vertex_frame

@@ -9,7 +9,7 @@ from dln_jax.mechanics import hamiltonian
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem, conjugate, legendre
 from dln_jax.scenes import scene as textbook
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole
 from dln_jax.solvers.elimination import solve
 
 

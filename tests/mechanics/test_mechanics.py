@@ -8,8 +8,7 @@ import pytest
 from dln_jax.mechanics import closed_form, lagrangian, natural
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem, legendre
-from dln_jax.scenes.pendulums import double_pendulum, pendulum
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole, double_pendulum, pendulum
 from dln_jax.scenes.scene import closed_form_forward_dynamics
 
 SCENES = [pendulum(acceleration=0.0, friction=0.3), double_pendulum(friction=0.2), cart_pole()]

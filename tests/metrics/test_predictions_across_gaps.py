@@ -7,7 +7,7 @@ from calls import one_line
 
 from dln_jax import HamiltonianSystem, Model
 from dln_jax.data import schema
-from dln_jax.metrics.measured_predictions import (
+from dln_jax.metrics.motions import (
     cut_recordings,
     grid_places,
     predict_measured,

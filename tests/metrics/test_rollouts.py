@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax import LagrangianSystem, PlainDynamics, dynamics
 from dln_jax.data import schema
-from dln_jax.metrics.rollouts import (
+from dln_jax.metrics.motions import (
     Motion,
     by_trajectory,
     follow,

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.models.lagrangian import make_delan
+from dln_jax.models.model import make_delan
 from dln_jax.types import Needs
 
 

@@ -13,14 +13,14 @@ from dln_jax.mechanics import hamiltonian, lagrangian
 from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.metrics.definiteness import definiteness
+from dln_jax.metrics.errors import definiteness
 from dln_jax.models.baselines import make_feed_forward
 from dln_jax.models.hamiltonian import (
     make_black_box_hamiltonian,
     make_separable_hamiltonian,
     make_structured_hamiltonian,
 )
-from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
+from dln_jax.models.model import make_black_box_lagrangian, make_delan
 from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import build, describe
 from tests.models.random_parameters import drawn

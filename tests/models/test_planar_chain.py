@@ -6,9 +6,8 @@ import numpy as np
 from calls import one_line
 
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.models.planar_chain import make_planar_chain
-from dln_jax.scenes.pendulums import double_pendulum
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.models.trigonometric import make_planar_chain
+from dln_jax.scenes.pendulums import cart_pole, double_pendulum
 from dln_jax.types import Needs
 from tests.models.random_parameters import drawn
 

@@ -3,7 +3,7 @@
 from calls import one_line
 from planar_arm import ARM
 
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.trees import make_rigid_tree
 
 
 def test_frictions_that_no_tree_has_are_refused():

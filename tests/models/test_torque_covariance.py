@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.models.torque_covariance import States, torque_covariance
-from dln_jax.models.trigonometric_kernel import make_trigonometric_kernel
+from dln_jax.models.kernel import States, make_trigonometric_kernel, torque_covariance
 from dln_jax.types import Needs
 
 

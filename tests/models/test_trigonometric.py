@@ -16,8 +16,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.scenes.datasets.generators import uniform
-from dln_jax.scenes.pendulums import pendulum, two_link_arm
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole, pendulum, two_link_arm
 from dln_jax.solvers.least_squares import solve, solve_chunks
 from dln_jax.types import Needs
 

@@ -25,8 +25,7 @@ from dln_jax.data import schema
 from dln_jax.data.checks.report import quick
 from dln_jax.data.splits import split
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.pendulums import pendulum, two_link_arm
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole, pendulum, two_link_arm
 
 SMALL = "--width 4 --depth 1"
 BRIEF = "--no-figures --no-uncertainty"

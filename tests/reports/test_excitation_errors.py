@@ -8,7 +8,7 @@ from dln_jax.identification.excitation.limits import MotionLimits
 from dln_jax.identification.excitation.task import make_task
 from dln_jax.mechanics.trees.description import dh_frames, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.trees import make_rigid_tree
 from scripts.reports.robots.known_kinematics import error_ratios
 
 LINK = inertial_parameters(1.0, [0.2, 0.0, 0.0], 0.01 * np.eye(3))

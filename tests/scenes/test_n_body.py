@@ -9,7 +9,7 @@ import pytest
 from calls import one_line
 
 from dln_jax.mechanics.equations import dynamics, flow
-from dln_jax.models.n_body import make_pairwise_hamiltonian
+from dln_jax.models.hamiltonian import make_pairwise_hamiltonian
 from dln_jax.scenes.particles import n_body
 from dln_jax.types import Needs
 from tests.models.random_parameters import drawn

@@ -7,8 +7,15 @@ import pytest
 from calls import one_line
 
 from dln_jax.mechanics import closed_form, lagrangian
-from dln_jax.scenes.pendulums import chain, double_pendulum, joint_angles, pendulum, two_link_arm
-from dln_jax.scenes.poles import cart_pole, flexible_cart_pole
+from dln_jax.scenes.pendulums import (
+    cart_pole,
+    chain,
+    double_pendulum,
+    flexible_cart_pole,
+    joint_angles,
+    pendulum,
+    two_link_arm,
+)
 from dln_jax.scenes.scene import actuation_matrix
 
 

@@ -10,7 +10,7 @@ from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import Split, select
 from dln_jax.learning.fit import Fit
 from dln_jax.learning.objectives import CANONICAL, STATED
-from dln_jax.metrics.rollouts import Motion
+from dln_jax.metrics.motions import Motion
 from dln_jax.models.model import Model
 from dln_jax.runs.evaluation import verdict_of as verdict_and_metrics
 

@@ -30,7 +30,7 @@ from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.integrators import Tableau, runge_kutta
 from dln_jax.nn.activations import softplus
-from dln_jax.scenes.poles import cart_pole, rotary_pendulum
+from dln_jax.scenes.pendulums import cart_pole, rotary_pendulum
 from dln_jax.types import JointKind, Scalar
 
 MARGIN = 1e-3

@@ -62,7 +62,7 @@ def make_task(
     noise: Any = 1.0,
     seed: int = 0,
 ) -> Task:
-    """Makes a task for a model whose force is linear in its parameters, such as `models.rigid_tree.make_rigid_tree`.
+    """Makes a task for a model whose force is linear in its parameters, such as `models.trees.make_rigid_tree`.
 
     Smooth any friction that has a step at rest, on a scale of velocities that motions pass slowly.
 

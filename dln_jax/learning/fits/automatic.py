@@ -38,9 +38,8 @@ from dln_jax.learning.settings import Automatic, Kernel, LearnedTree, Network, T
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction.laws import USUAL, FrictionShape, shape_of
 from dln_jax.mechanics.trees.description import tree_to_json
-from dln_jax.metrics.definiteness import definiteness
-from dln_jax.models.rigid_tree import RigidTreeParameters
-from dln_jax.models.serial_tree import tree_of
+from dln_jax.metrics.errors import definiteness
+from dln_jax.models.trees import RigidTreeParameters, tree_of
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build, describe
 from dln_jax.zoo.run import load

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
@@ -27,7 +28,7 @@ from dln_jax.learning.kinematics.projection import (
 from dln_jax.learning.kinematics.search import ALIKE, Search, Searched, agreeing, search
 from dln_jax.learning.linear import design_chunks
 from dln_jax.learning.objectives import torque_scale
-from dln_jax.models.serial_tree import SerialTreeParameters, make_serial_tree, rotation_vector
+from dln_jax.models.trees import SerialTreeParameters, make_serial_tree
 from dln_jax.solvers import least_squares
 from dln_jax.types import InputError, Needs, require_positive
 
@@ -88,7 +89,7 @@ def fit_tree(
 
     Gauss-Newton refines random frames on a subset of the samples, with all else eliminated (`projection`). The best are
     refined on all samples, with joints weighted by their unexplained torque. Validation chooses between local minima
-    whose losses differ by less than a factor of two. Handedness and other gauges (see `models.serial_tree`) are
+    whose losses differ by less than a factor of two. Handedness and other gauges (see `models.trees`) are
     arbitrary. The search goes on until another descent to the same loss has found the same arm (`agreement`).
 
     Args:
@@ -249,7 +250,7 @@ def _columns(structure: Structure) -> Callable:
 
 def _parameters(structure: Structure, frames: Frames, linear: np.ndarray) -> SerialTreeParameters:
     armature, *friction = linear[len(structure.inertial) :].reshape(-1, len(structure.joints))
-    turns = np.array([rotation_vector(R) for R in np.asarray(frames.rotations)])
+    turns = Rotation.from_matrix(np.asarray(frames.rotations)).as_rotvec()
     inertias = inertias_of(structure, jnp.asarray(linear))
     parts = (turns, frames.positions, inertias, armature, *(friction or (None, None, None)))
     return SerialTreeParameters(*(None if part is None else jnp.asarray(part) for part in parts))

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dln_jax.mechanics.trees.description import dh_frames
-from dln_jax.models.serial_tree import rotation
+from dln_jax.models.trees import rotation
 from dln_jax.types import InputError, JointKind, finite_array
 
 FIELDS = {"axes": 3, "points": 3, "dh_rows": 4}

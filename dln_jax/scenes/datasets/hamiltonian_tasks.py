@@ -31,20 +31,58 @@ noise. The published motions were integrated to about 1e-6; here energies are co
 
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import select
 from dln_jax.mechanics import hamiltonian
+from dln_jax.mechanics.integrators import adaptive_rollout
 from dln_jax.precision import in_float64
-from dln_jax.scenes.datasets.phase_samples import PhaseTask, make_task
 from dln_jax.scenes.particles import henon_heiles as henon_heiles_scene
 from dln_jax.scenes.particles import mass_spring, n_body
 from dln_jax.scenes.pendulums import double_pendulum as double_pendulum_scene
 from dln_jax.scenes.pendulums import pendulum as pendulum_scene
 from dln_jax.scenes.scene import Scene
-from dln_jax.types import Hamiltonian, InputError, Potential, Scalar, Vector
+from dln_jax.types import Dissipation, Hamiltonian, InputError, Potential, Scalar, Vector, require_positive
+
+_GROUP = 500
+
+
+class PhaseField(NamedTuple):
+    """Time derivatives of states."""
+
+    qd: Float[np.ndarray, "N d"]
+    pd: Float[np.ndarray, "N d"]
+
+
+class PhaseSamples(NamedTuple):
+    """One side of the published split; all members have the same N samples."""
+
+    data: Trajectories
+    """As published: q and p with noise; qd, pd (and qdd) of the noiseless motion; tau = 0 exactly."""
+    clean: Trajectories
+    """The same samples without noise."""
+    field: PhaseField
+    """The exact (qd, pd) at the noisy q, p of `data`."""
+
+
+class PhaseTask(NamedTuple):
+    """A published dataset and the system that generated it."""
+
+    scene: Scene
+    hamiltonian: Hamiltonian
+    """(q, p) -> the textbook H of one state."""
+    published_energy: Hamiltonian
+    """(q, p) -> the quantity published as the energy: q² + p² for the pendulum, else H."""
+    t: np.ndarray
+    """Times of every trajectory [T], s."""
+    train: PhaseSamples
+    test: PhaseSamples
 
 
 @in_float64
@@ -53,7 +91,7 @@ def spring(
 ) -> PhaseTask:
     """Mass on a spring, H = q² + p²: mass ½, stiffness 2; damped by `friction` (force over velocity)."""
     scene = mass_spring(mass=0.5, stiffness=2.0, friction=friction)
-    return _oscillator(scene, _circle, _circle, 30, (0.1, 1.0), seed, trajectories, noise, tolerance)
+    return _oscillator(scene, _circle, 30, (0.1, 1.0), seed, trajectories, noise, tolerance)
 
 
 @in_float64
@@ -62,7 +100,7 @@ def pendulum(
 ) -> PhaseTask:
     """Pendulum, H = 3 (1 - cos q) + p²: mass ½, length 1, acceleration 6; damped by `friction`."""
     scene = pendulum_scene(mass=0.5, length=1.0, acceleration=6.0, friction=friction)
-    return _oscillator(scene, _swing, _circle, 45, (1.3, 2.3), seed, trajectories, noise, tolerance)
+    return _oscillator(scene, _swing, 45, (1.3, 2.3), seed, trajectories, noise, tolerance)
 
 
 @in_float64
@@ -74,7 +112,7 @@ def two_body(seed: int = 0, *, trajectories: int = 1000, tolerance: float = 1e-1
         x = 0.5 + random.rand(2)
         velocity = _turned(x, np.pi / 2) / (2 * np.hypot(*x) ** 1.5) * (1 + 0.05 * random.randn())
         starts.append(([*x, *-x], [*velocity, *-velocity]))
-    return _without_noise(*_attracting(2), np.array(starts), np.linspace(0, 20, 50), tolerance)
+    return _task(*_attracting(2), np.array(starts), np.linspace(0, 20, 50), tolerance)
 
 
 @in_float64
@@ -92,7 +130,7 @@ def three_body(seed: int = 0, *, trajectories: int = 5000, tolerance: float = 1e
         change = 1 + 0.2 * (2 * random.rand(3, 2) - 1)
         q, p = (np.array([_turned(vector, k * third) for k in range(3)]) for vector in (x, velocity))
         starts.append((q.ravel(), (change * p).ravel()))
-    return _without_noise(*_attracting(3), np.array(starts), np.linspace(0, 5, 20), tolerance)
+    return _task(*_attracting(3), np.array(starts), np.linspace(0, 5, 20), tolerance)
 
 
 damped_spring = functools.partial(spring, friction=0.1)
@@ -109,7 +147,7 @@ def henon_heiles(seed: int = 0, *, trajectories: int = 100, tolerance: float = 1
     q = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     kinetic = random.uniform(0.05, 0.125, trajectories) - np.asarray(jax.vmap(_potential(scene))(jnp.asarray(q)))
     p = np.sqrt(2 * kinetic)[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
-    return _without_noise(scene, H, np.stack([q, p], axis=1), np.linspace(0, 10, 50), tolerance)
+    return _task(scene, H, np.stack([q, p], axis=1), np.linspace(0, 10, 50), tolerance)
 
 
 @in_float64
@@ -117,11 +155,7 @@ def double_pendulum(seed: int = 0, *, trajectories: int = 100, tolerance: float 
     """The double pendulum of 1 kg and 1 m, released from rest."""
     q = np.random.default_rng(seed).uniform(-1.2, 1.2, (trajectories, 2))
     starts = np.stack([q, np.zeros_like(q)], axis=1)
-    return _without_noise(*_system(double_pendulum_scene), starts, np.linspace(0, 2.5, 50), tolerance)
-
-
-def _without_noise(scene: Scene, H: Hamiltonian, starts: np.ndarray, t: np.ndarray, tolerance: float) -> PhaseTask:
-    return make_task(scene, H, H, starts, None, t, slice(len(starts) // 5, None), tolerance)
+    return _task(*_system(double_pendulum_scene), starts, np.linspace(0, 2.5, 50), tolerance)
 
 
 # One cached object per system, so that jit finds functions already compiled.
@@ -161,7 +195,6 @@ def _turned(vector: np.ndarray, angle: float) -> np.ndarray:
 def _oscillator(
     scene: Scene,
     H: Hamiltonian,
-    published_energy: Hamiltonian,
     samples: int,
     radii: tuple[float, float],
     seed: int,
@@ -178,10 +211,101 @@ def _oscillator(
         radius = radii[0] + (radii[1] - radii[0]) * random.rand()
         starts.append(direction * radius / np.hypot(*direction))
         errors.append(noise * random.randn(2, samples))
-    half = trajectories // 2
-    t = np.linspace(0, 3, samples)
     starts, errors = np.array(starts).reshape(-1, 2, 1), np.array(errors).reshape(-1, 2, samples, 1)
-    return make_task(scene, H, published_energy, starts, errors, t, slice(0, half), tolerance)
+    task = _task(scene, H, starts, np.linspace(0, 3, samples), tolerance, errors, slice(0, trajectories // 2))
+    return task._replace(published_energy=_circle)
+
+
+def _task(
+    scene: Scene,
+    H: Hamiltonian,
+    starts: Float[np.ndarray, "K two d"],
+    t: Float[np.ndarray, " T"],
+    tolerance: float,
+    errors: Float[np.ndarray, "K two T d"] | None = None,
+    training: slice | None = None,
+) -> PhaseTask:
+    """Makes a task from starts (q, p) at the times t, with errors of both; by default the first fifth is the test.
+
+    Raises:
+        InputError: one side of the split has no trajectories.
+    """
+    order = np.arange(len(starts))
+    train = order[training or slice(len(order) // 5, None)]
+    test = np.setdiff1d(order, train)
+    if not len(train) or not len(test):
+        raise InputError(f"trajectories is {len(starts)}; expected enough to leave some on both sides of the split")
+    d = scene.needs.degrees_of_freedom
+    motion = reference_motion(H, starts[:, 0], starts[:, 1], t, dissipation=scene.dissipation, tolerance=tolerance)
+    exact = functools.partial(_fields, H, scene.dissipation)
+    q, p = (states.reshape(-1, d) for states in motion)
+    field = qd, pd = tuple(np.asarray(rate) for rate in exact(q, p))
+    qdd = np.asarray(_accelerations(H, q, p, qd, pd))
+    trajectory, label = np.repeat(order, len(t)), np.array([f"{scene.name}-{index}" for index in order])
+    times, tau = np.tile(t, len(starts)), np.zeros_like(q)
+    data = clean = Trajectories(times, q, qd, qdd, tau, trajectory, label, p, pd, needs=scene.needs)
+    if errors is not None:
+        data = clean._replace(q=q + errors[:, 0].reshape(-1, d), p=p + errors[:, 1].reshape(-1, d))
+        field = tuple(np.asarray(rate) for rate in exact(data.q, data.p))
+
+    def part(indices: np.ndarray) -> PhaseSamples:
+        chosen = np.isin(trajectory, indices)
+        rates = PhaseField(*(rate[chosen] for rate in field))
+        return PhaseSamples(select(data, indices), select(clean, indices), rates)
+
+    return PhaseTask(scene, H, H, t, part(train), part(test))
+
+
+@in_float64
+def reference_motion(
+    H: Hamiltonian,
+    q: Float[np.ndarray, "K d"],
+    p: Float[np.ndarray, "K d"],
+    t: Float[np.ndarray, " T"],
+    *,
+    dissipation: Dissipation | None = None,
+    tolerance: float = 1e-12,
+) -> tuple[Float[np.ndarray, "K T d"], Float[np.ndarray, "K T d"]]:
+    """Returns free motions (q, p) at times t from states at t[0], integrated adaptively to a tolerance per step.
+
+    States between steps are interpolated, with an error of a few hundred times the tolerance.
+
+    Raises:
+        InputError: an integration does not finish, for example because bodies meet.
+    """
+    require_positive(tolerance=tolerance)
+    # All motions of a call take as many steps as the slowest one, so groups save time. The last group is padded.
+    size = min(len(q), _GROUP)
+    groups = [np.minimum(np.arange(first, first + size), len(q) - 1) for first in range(0, len(q), size)]
+    solved = [_solve(H, dissipation, tolerance, q[group], p[group], t) for group in groups]
+    if not all(bool(successful.all()) for _, successful in solved):
+        raise InputError(f"a motion could not be integrated to {tolerance:g}; ask for less accuracy or time")
+    motions = (np.concatenate([states[half] for states, _ in solved])[: len(q)] for half in range(2))
+    return next(motions), next(motions)
+
+
+# Compiled once per Hamiltonian, so further seeds start at once.
+@functools.partial(jax.jit, static_argnames=("H", "dissipation", "tolerance"))
+def _solve(H: Hamiltonian, dissipation: Dissipation | None, tolerance: float, q, p, t):
+    def rate(t, state):
+        return _field(H, dissipation, *state)
+
+    return jax.vmap(lambda q, p: adaptive_rollout(rate, (q, p), t, tolerance=tolerance))(q, p)
+
+
+@functools.partial(jax.jit, static_argnames=("H", "dissipation"))
+def _fields(H: Hamiltonian, dissipation: Dissipation | None, q, p):
+    return jax.vmap(functools.partial(_field, H, dissipation))(q, p)
+
+
+def _field(H: Hamiltonian, dissipation: Dissipation | None, q: Vector, p: Vector) -> tuple[Vector, Vector]:
+    return hamiltonian.time_derivative(H, q, p, jnp.zeros_like(q), dissipation=dissipation)
+
+
+@functools.partial(jax.jit, static_argnames=("H",))
+def _accelerations(H: Hamiltonian, q, p, qd, pd):
+    """Returns qdd = d/dt dH/dp along the motion."""
+    return jax.vmap(lambda *state: jax.jvp(jax.grad(H, argnums=1), state[:2], state[2:])[1])(q, p, qd, pd)
 
 
 Protocol = Callable[..., PhaseTask]

@@ -23,12 +23,12 @@ from dln_jax.data.splits import (
     segments,
     select,
     select_samples,
+    stated_test,
     with_joints,
 )
-from dln_jax.data.stated_tests import stated_test
 from dln_jax.learning.measured_motions import MeasuredWindows, Noise
 from dln_jax.learning.motions import Weights
-from dln_jax.metrics.measured_predictions import cut_recordings, grid_places
+from dln_jax.metrics.motions import cut_recordings, grid_places
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.types import InputError, Needs
 

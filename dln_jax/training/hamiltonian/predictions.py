@@ -12,7 +12,7 @@ from dln_jax.figures.phase_space import Field, motion_figure
 from dln_jax.figures.style import TRUTH
 from dln_jax.learning.measured_motions import MeasuredWindows
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.measured_predictions import on_grid, padded, predict_measured, prediction_metrics
+from dln_jax.metrics.motions import on_grid, padded, predict_measured, prediction_metrics
 from dln_jax.metrics.phase_space import (
     Motions,
     energies,

@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax.sharding import Mesh
 
+from dln_jax.control.optimal.problem import checked
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.learning.engine.optimisers import Optimiser, optimiser_named
 from dln_jax.learning.engine.problem import Progress, losses
 from dln_jax.runs.arguments import numbers_of, require_positive_if_given
-from dln_jax.runs.encoders import checked, facts, needs_from_option
+from dln_jax.runs.encoders import needs_from_option
+from dln_jax.runs.logs import facts
 from dln_jax.runs.progress import progress
 from dln_jax.runs.report import Report
 from dln_jax.scale.devices import device_lines

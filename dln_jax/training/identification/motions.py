@@ -19,7 +19,7 @@ from dln_jax.identification import equations
 from dln_jax.identification.identify import Identification, identify, parameters_of
 from dln_jax.identification.motions import REWEIGHTINGS, MotionFit, cut_motions, fit_motions
 from dln_jax.learning.measured_motions import MeasuredWindows
-from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, valid_times
+from dln_jax.metrics.motions import cut_segments, predict_measured, valid_times
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError
 

@@ -9,8 +9,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from dln_jax.data.robot_files import write_robot
-from dln_jax.figures.joints import friction_curves
-from dln_jax.figures.torques import torque_by_joint
+from dln_jax.figures.torques import friction_curves, torque_by_joint
 from dln_jax.files import write_bytes, write_json
 from dln_jax.identification.consistent import is_consistent
 from dln_jax.identification.identify import Identification, identify, parameters_of
@@ -20,7 +19,7 @@ from dln_jax.identification.residual import ResidualFit
 from dln_jax.mechanics.trees.motors import armature_matrix
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.metrics.verdict import Verdict
-from dln_jax.models.rigid_tree import pairs_of
+from dln_jax.models.trees import pairs_of
 from dln_jax.runs.report import Report, png
 from dln_jax.training.identification.additions import (
     ADDED,

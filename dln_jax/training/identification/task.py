@@ -16,18 +16,20 @@ from dln_jax.data.splits import (
     by_motion,
     every,
     in_blocks,
+    is_cut,
     label_indices,
     require_no_copies,
     select,
+    stated_test,
     with_joints,
 )
-from dln_jax.data.stated_tests import is_cut, stated_test
 from dln_jax.learning.friction import FrictionFit, fit_friction
 from dln_jax.mechanics.friction.laws import FrictionShape, require_laws
 from dln_jax.mechanics.trees.description import tree_to_json
 from dln_jax.models.model import Parameters
 from dln_jax.runs.arguments import names_in, names_listed, numbers_of, refuse_given, require_positive_if_given
-from dln_jax.runs.encoders import facts, fitted_torque, prepare_log, without_torque
+from dln_jax.runs.encoders import fitted_torque, prepare_log, without_torque
+from dln_jax.runs.logs import facts
 from dln_jax.training.identification.motions import MotionSets, lightly_filtered
 from dln_jax.training.identification.options import IDENTIFIED, NO_FRICTION, Options
 from dln_jax.training.identification.terms import Wanted, at_reference, chosen, wanted

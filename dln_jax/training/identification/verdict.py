@@ -11,7 +11,7 @@ from dln_jax.identification.identify import Identification, parameters_of
 from dln_jax.identification.shared_motors import MOST, shared_motor
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.metrics.verdict import WORSE, Verdict, held_out, judge, verdict_metrics, worst
-from dln_jax.models.rigid_tree import RigidTreeParameters
+from dln_jax.models.trees import RigidTreeParameters
 from dln_jax.training.identification.additions import Predict
 from dln_jax.training.identification.task import Case
 

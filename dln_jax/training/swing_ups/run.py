@@ -28,8 +28,13 @@ from dln_jax.control.plants.ways import require_recovery
 from dln_jax.control.swing_up import SwingUp
 from dln_jax.control.tracking import without_friction
 from dln_jax.data import schema
-from dln_jax.figures.closed_loop_animations import cart_pole_drawing, rotary_pendulum_drawing, write_closed_loop_gif
-from dln_jax.figures.closed_loops import MOST_SHOWN, closed_loop_traces
+from dln_jax.figures.closed_loops import (
+    MOST_SHOWN,
+    cart_pole_drawing,
+    closed_loop_traces,
+    rotary_pendulum_drawing,
+    write_closed_loop_gif,
+)
 from dln_jax.files import write_figure, write_json
 from dln_jax.learning.recordings import STEPS
 from dln_jax.mechanics.dynamics import Dynamics

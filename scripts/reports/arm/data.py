@@ -15,7 +15,7 @@ from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import Driven
 from dln_jax.mechanics.integrators import rollout, symplectic_euler
 from dln_jax.metrics.errors import as_arrays, prediction_program, samples_of
-from dln_jax.metrics.rollouts import metrics_of_motions, motion_program, records_of
+from dln_jax.metrics.motions import metrics_of_motions, motion_program, records_of
 from dln_jax.precision import in_float64
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.datasets.generators import CHARACTERS_TEST

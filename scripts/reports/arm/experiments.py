@@ -34,9 +34,8 @@ from dln_jax.learning.online import Refit, appended, empty_replay, learn_online,
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.errors import mean_square
 from dln_jax.models.baselines import make_feed_forward
-from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
-from dln_jax.models.model import Model, Parameters
-from dln_jax.models.planar_chain import make_planar_chain
+from dln_jax.models.model import Model, Parameters, make_black_box_lagrangian, make_delan
+from dln_jax.models.trigonometric import make_planar_chain
 from dln_jax.scenes.datasets.generators import CHARACTERS_TEST
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.types import InputError

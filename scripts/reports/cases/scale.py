@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 from dln_jax import Adam, GaussNewton, fit
 from dln_jax.data.splits import Split, select
 from dln_jax.learning.dynamics import problem
-from dln_jax.models.lagrangian import make_delan
+from dln_jax.models.model import make_delan
 from dln_jax.rollout import rollout
 from dln_jax.scale.mesh import batch_mesh, program, replicate, spread
 from dln_jax.scale.processes import host_devices

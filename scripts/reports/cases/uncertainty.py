@@ -26,7 +26,7 @@ from dln_jax.mechanics.trees.description import dh_frames, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.metrics.coverage import LEVEL, coverage
 from dln_jax.models.model import Parameters
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.trees import make_rigid_tree
 from dln_jax.runs.evaluation import CHUNK, bands
 from dln_jax.scenes.datasets.generators import characters, uniform
 from dln_jax.scenes.pendulums import two_link_arm

@@ -40,7 +40,7 @@ from dln_jax.learning.kinematics.search import Search
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.errors import normalised_error
-from dln_jax.models.serial_tree import make_serial_tree
+from dln_jax.models.trees import make_serial_tree
 from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.control import plans
 from scripts.reports.control.problems import Sizes, in_jax

@@ -32,7 +32,7 @@ from dln_jax.learning.weak_forms import fit_momentum
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees.description import dh_frames, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.trees import make_rigid_tree
 from dln_jax.types import FrictionLaw
 from scripts.reports.robots.arm import (
     D,

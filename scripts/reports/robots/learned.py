@@ -24,9 +24,8 @@ from dln_jax.mechanics import equations
 from dln_jax.mechanics.trees.description import make_tree
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.mechanics.trees.recursions import newton_euler
-from dln_jax.models.rigid_tree import make_rigid_tree
-from dln_jax.models.serial_tree import make_serial_tree
-from dln_jax.models.trigonometric_kernel import make_trigonometric_kernel
+from dln_jax.models.kernel import make_trigonometric_kernel
+from dln_jax.models.trees import make_rigid_tree, make_serial_tree
 from dln_jax.types import FrictionLaw, Needs
 from scripts.reports.robots.simulated_arms import Arm, lip_trajectories, panda, skew_arm, sliding_arm, waves
 from scripts.reports.run import Numbers

@@ -21,11 +21,10 @@ from dln_jax.learning.kinematics.fit import fit_tree
 from dln_jax.learning.linear import design, unravelled
 from dln_jax.mechanics.trees.description import serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters
-from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, valid_times
+from dln_jax.metrics.motions import cut_segments, predict_measured, valid_times
 from dln_jax.models.model import Parameters
-from dln_jax.models.planar_chain import make_planar_chain
-from dln_jax.models.rigid_tree import make_rigid_tree
-from dln_jax.models.serial_tree import tree_of
+from dln_jax.models.trees import make_rigid_tree, tree_of
+from dln_jax.models.trigonometric import make_planar_chain
 from dln_jax.solvers import least_squares
 from dln_jax.training.identification.motions import MotionSets, fit_by
 from dln_jax.types import FrictionLaw, InputError, Needs

@@ -17,7 +17,7 @@ from dln_jax.control.state_space import field_of, integrated
 from dln_jax.export.c.interface import stated_costs
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole
 
 SCENE = cart_pole()
 MODEL, B = dln_jax.dynamics(SCENE.closed_form), np.array(SCENE.needs.actuation)

@@ -14,8 +14,7 @@ from dln_jax.control.estimate.process import Process, belief, mechanical
 from dln_jax.control.estimate.tuning import consistency, from_log, tuned
 from dln_jax.control.estimate.unscented import unscented
 from dln_jax.data.schema import Trajectories
-from dln_jax.scenes.pendulums import pendulum
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole, pendulum
 
 F = np.array([[1.0, 0.1, 0.0], [-0.2, 0.95, 0.05], [0.0, 0.0, 0.9]])
 B, G = np.array([[0.0], [0.1], [0.3]]), np.array([[0.0, 0.02], [0.1, 0.0], [0.0, 0.3]])

@@ -10,7 +10,7 @@ from dln_jax.control.optimal.plants import evaluate, starts
 from dln_jax.control.plants.plant import layout
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole
 
 
 def rod(length=1.0):

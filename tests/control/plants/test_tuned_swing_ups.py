@@ -18,7 +18,7 @@ from dln_jax.control.plants.tuning import trial_of, tune
 from dln_jax.control.state_space import field_of
 from dln_jax.control.swing_up import upright_of
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole
 
 SIZES = {"cart_mass": 0.6, "pole_mass": 0.15, "length": 0.25}
 

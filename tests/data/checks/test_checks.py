@@ -16,14 +16,15 @@ from dln_jax.data.checks.priors import STRONGEST, WEAKEST, Explanation, covarian
 from dln_jax.data.checks.report import examine, quick, read, report
 from dln_jax.data.checks.torques import decisive
 from dln_jax.data.encoders.smoothing import smooth
+from dln_jax.data.log import FILTERED
 from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics.trees.description import dh_frames, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.mechanics.trees.recursions import newton_euler
 from dln_jax.runs.arguments import arguments_of
-from dln_jax.runs.encoders import FILTERED, prepare_log
+from dln_jax.runs.encoders import prepare_log
 from dln_jax.scenes.datasets import generators
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole
 
 SAMPLES, RUNS = 700, 4
 RIGHT = np.pi / 2

@@ -17,8 +17,7 @@ from dln_jax.mechanics.dynamics import Dynamics, InverseForward, PhaseRates
 from dln_jax.mechanics.equations import Canonical, dynamics, flow
 from dln_jax.mechanics.trees.description import serial, tree_to_json
 from dln_jax.mechanics.trees.inertia import inertial_parameters
-from dln_jax.scenes.pendulums import double_pendulum
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole, double_pendulum
 from dln_jax.types import Needs
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build, describe

@@ -15,8 +15,7 @@ from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.interface import stated_costs
 from dln_jax.export.c.load import STANDARD, load_c
 from dln_jax.export.c.source import export_c
-from dln_jax.scenes.pendulums import chain
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole, chain
 
 LEVELS = {False: (("-O1",), ("-Os",)), True: (("-O2",), ("-O3", "-march=native"))}
 """Flags of a compiler, by whether arguments are stated finite."""

@@ -22,8 +22,8 @@ from dln_jax.identification.excitation.task import independent_columns, linear_f
 from dln_jax.learning.linear import fit_linear, linearised
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees.frames import world_frames
-from dln_jax.models.planar_chain import make_planar_chain
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.trees import make_rigid_tree
+from dln_jax.models.trigonometric import make_planar_chain
 from dln_jax.types import Needs
 from tests.calls import one_line
 from tests.models.random_parameters import drawn

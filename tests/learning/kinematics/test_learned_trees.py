@@ -9,7 +9,7 @@ from dln_jax.learning.kinematics.fit import fit_tree
 from dln_jax.learning.kinematics.search import Search
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees.description import make_tree
-from dln_jax.models.serial_tree import make_serial_tree
+from dln_jax.models.trees import make_serial_tree
 from scripts.reports.robots.simulated_arms import lip_trajectories, skew_arm
 
 NOISE = 0.01

@@ -11,7 +11,7 @@ from dln_jax.mechanics.trees.description import dh_frames, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.mechanics.trees.motors import armature_matrix, motor_regressor, motors_of, require_motors, single_motors
 from dln_jax.mechanics.trees.recursions import composite_bodies, kinetic_energy, newton_euler
-from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.trees import make_rigid_tree
 
 FRAMES = dh_frames([[0, 0, 0.3, 0], [-np.pi / 2, 0, 0, 0], [0, 0.4, 0, 0.2]])
 LINKS = [inertial_parameters(m, [0.05, -0.02, 0.1], np.diag([0.02, 0.03, 0.01])) for m in (3.0, 2.0, 1.0)]

@@ -9,7 +9,7 @@ from dln_jax import dynamics
 from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.control.optimal.problem import rates
 from dln_jax.control.state_space import field_of
-from dln_jax.scenes.poles import cart_pole
+from dln_jax.scenes.pendulums import cart_pole
 from scripts.reports.control import plants, problems, values
 
 

@@ -12,9 +12,8 @@ from conftest import slow_among
 
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.datasets import hamiltonian_tasks, phase_samples
-from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS
-from dln_jax.scenes.datasets.phase_samples import reference_motion
+from dln_jax.scenes.datasets import hamiltonian_tasks
+from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS, reference_motion
 from dln_jax.scenes.particles import henon_heiles, mass_spring, n_body
 
 SCENES = [
@@ -201,7 +200,7 @@ def test_seeds_decide_and_the_first_start_is_the_published():
 
 def test_circular_orbits_are_keplers(monkeypatch):
     """Bodies at ±r turn at the rate (4 r³)^-½; more motions than a group, the last one not full."""
-    monkeypatch.setattr(phase_samples, "_GROUP", 20)
+    monkeypatch.setattr(hamiltonian_tasks, "_GROUP", 20)
     r, t = np.linspace(0.6, 2.0, 30)[:, None], task("two-body").t
     rate, none = (4 * r**3) ** -0.5, 0 * r
     start = np.hstack([r, none, -r, none]), r * rate * np.array([0.0, 1, 0, -1])

@@ -1,8 +1,8 @@
-"""Tree of rigid bodies with known frames; its inertias, armature and friction are the parameters.
+"""Trees of rigid bodies: their inertias, armature and friction, and frames that are not known, are the parameters.
 
-Forces are linear in these parameters, so `learning.linear.fit_linear(..., negligible=1e-12)` identifies all at once.
-Data determine only combinations of the eleven numbers per joint ("base parameters"). A fit returns the shortest
-solution that predicts the same forces, which need not be physically consistent.
+With known frames forces are linear in these parameters, so `learning.linear.fit_linear(..., negligible=1e-12)`
+identifies all at once. Data determine only combinations of the eleven numbers per joint ("base parameters"). A fit
+returns the shortest solution that predicts the same forces, which need not be physically consistent.
 
 Forces are not linear in the shape of friction, the share of load and the cooling coefficient, which are fixed when the
 model is built; `learning.friction.fit_friction` fits them. Viscous friction of warm grease is lower:
@@ -10,15 +10,30 @@ model is built; `learning.friction.fit_friction` fits them. Viscous friction of 
     b(T) = b exp(-k (T - T_ref))
 
 For motors that turn with several joints, and armature as a matrix, see `mechanics.trees.motors`.
+
+In an arm with unknown kinematics the joint frames are parameters too (`make_serial_tree`). Links form a tree in a given
+order, a serial chain by default. Torques do not identify all six numbers of a frame. The
+directions without effect ("gauges") are
+
+- rotating a link's frame about its joint's axis, or sliding it along the axis, together with the link's inertia and the
+  next frames: an axis in space has four numbers, the direction of a prismatic joint two;
+- the position of the base and its angle about the vertical: only the angle between first axis and gravity counts;
+- mirroring the whole arm, with axes as pseudo-vectors: torques cannot distinguish left-handed from right-handed arms.
+
+`learning.kinematics.fit_tree` fits these parameters.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
+from jaxtyping import Float
 
+from dln_jax.mechanics.closed_form import RecursiveSystem
 from dln_jax.mechanics.friction.curves import joint_dissipation, require_shape
 from dln_jax.mechanics.friction.laws import USUAL, FrictionCoefficients, FrictionShape, coefficients_of, require_laws
 from dln_jax.mechanics.joint_friction import Load, with_friction
@@ -26,7 +41,7 @@ from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.motors import Pair, armature_matrix, motors_of, require_motors
 from dln_jax.mechanics.trees.recursions import tree_system
 from dln_jax.models.model import Model
-from dln_jax.types import FrictionLaw, InputError
+from dln_jax.types import FrictionLaw, InputError, Needs, require_positive
 
 Number = float | tuple[float, ...]
 """One number for all joints, or one per joint."""
@@ -138,3 +153,110 @@ def pairs_of(coupling: dict[str, Any] | None) -> dict[Pair, Any]:
     """Returns the entries of the armature by pairs of motors counted from 0."""
     named = (coupling or {}).items()
     return {(int(key.partition("_")[0]) - 1, int(key.partition("_")[2]) - 1): value for key, value in named}
+
+
+class SerialTreeParameters(NamedTuple):
+    """Parameters of an arm of d joints; absent friction is `None`."""
+
+    turns: Any
+    """[d, 3], rotation vectors of the links' frames relative to the parent link at q = 0, rad."""
+    positions: Any
+    """[d, 3], m."""
+    inertias: Any
+    """[d, 10], as `mechanics.trees.PARAMETERS`; identifiable combinations, which need not be physically consistent."""
+    armature: Any
+    """[d], kg m² or kg."""
+    viscous: Any
+    """[d], N m s or N s/m."""
+    coulomb: Any
+    """[d], N m or N."""
+    offset: Any
+    """[d], N m or N."""
+
+
+def make_serial_tree(
+    needs: Needs,
+    *,
+    parents: Sequence[int] | None = None,
+    acceleration: float = 9.81,
+    velocity_scale: float = 0.01,
+    dtype: DTypeLike = jnp.float64,
+) -> Model:
+    """Returns a tree of the needed joints whose frames are parameters.
+
+    Args:
+        needs: kinds of joints, gravity and friction (viscous, dry and an offset in every joint).
+        parents: parent link of every link, -1 for the ground; by default the one before.
+        acceleration: acceleration of gravity, m/s².
+        velocity_scale: velocity scale of dry friction, as for `mechanics.friction.joint_dissipation`; it is not fitted.
+
+    Raises:
+        InputError: parents are not earlier links, an acceleration or scale is not positive, or the needs have an
+            actuation matrix, a joint map or joint friction laws.
+    """
+    require_positive(acceleration=acceleration, velocity_scale=velocity_scale)
+    if needs.actuation is not None:
+        raise InputError("a learned tree has a motor at each joint; leave actuation out of the needs")
+    if needs.joint_map is not None:
+        raise InputError("a learned tree takes coordinates of its joints; leave joint_map out of the needs")
+    if needs.joint_friction:
+        raise InputError(
+            "a learned tree has viscous, dry and offset friction: state friction in its needs, and no joint_friction"
+        )
+    d = needs.degrees_of_freedom
+    if parents is not None and (
+        len(parents) != d or any(not -1 <= parent < link for link, parent in enumerate(parents))
+    ):
+        raise InputError(
+            f"parents are {tuple(parents)}; expected for each of {d} links one before it, or -1 for the ground"
+        )
+
+    def init(key: Array) -> SerialTreeParameters:
+        turns, positions = jax.random.normal(key, (2, d, 3), dtype)
+        body = jnp.asarray([1.0, 0, 0, 0, 0.02, 0, 0, 0.02, 0, 0.02], dtype)
+        none = jnp.zeros(d, dtype) if needs.friction else None
+        inertias, armature = jnp.tile(body, (d, 1)), jnp.full(d, 0.01, dtype)
+        return SerialTreeParameters(turns, 0.15 * positions, inertias, armature, none, none, none)
+
+    def energies(parameters: SerialTreeParameters) -> RecursiveSystem:
+        dissipation = None
+        if needs.friction:
+            coefficients = parameters.viscous, parameters.coulomb, parameters.offset
+            dissipation = joint_dissipation(*coefficients, velocity_scale=velocity_scale)
+        return tree_system(tree_of(parameters, needs, parents=parents, acceleration=acceleration), dissipation)
+
+    return Model(init, energies)
+
+
+def tree_of(
+    parameters: SerialTreeParameters,
+    needs: Needs,
+    *,
+    parents: Sequence[int] | None = None,
+    acceleration: float = 9.81,
+) -> Tree:
+    """Returns the tree of these parameters, like one with known frames; other arguments as for `make_serial_tree`."""
+    d = needs.degrees_of_freedom
+    return Tree(
+        parents=tuple(range(-1, d - 1)) if parents is None else tuple(parents),
+        joints=needs.joints,
+        rotations=jax.vmap(rotation)(jnp.asarray(parameters.turns)),
+        positions=parameters.positions,
+        axes=np.tile([0.0, 0.0, 1.0], (d, 1)),
+        inertias=parameters.inertias,
+        armature=parameters.armature,
+        gravity=np.array([0.0, 0.0, -acceleration if needs.gravity else 0.0]),
+    )
+
+
+def rotation(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """Returns the rotation matrix exp of a rotation vector, by Rodrigues' formula, smooth at zero."""
+    x, y, z = turn
+    zero = jnp.zeros_like(x)
+    hat = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
+    square = turn @ turn
+    small = square < 1e-8
+    angle = jnp.sqrt(jnp.where(small, 1.0, square))
+    first = jnp.where(small, 1 - square / 6, jnp.sin(angle) / angle)
+    second = jnp.where(small, 0.5 - square / 24, (1 - jnp.cos(angle)) / angle**2)
+    return jnp.eye(3, dtype=turn.dtype) + first * hat + second * hat @ hat
