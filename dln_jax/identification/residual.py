@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from dln_jax.data.arrays import spread
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import Split
+from dln_jax.data.splits import Split, select
 from dln_jax.learning import dynamics
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
@@ -25,6 +25,7 @@ from dln_jax.learning.objectives import SCALED_TORQUE, arrays, residuals
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.residual import ResidualParameters, frozen, make_residual, make_with_residual
 from dln_jax.types import InputError, Needs, ResidualTerm
+from dln_jax.zoo.descriptions import Description, describe
 
 
 class Candidate(NamedTuple):
@@ -42,6 +43,14 @@ CANDIDATES = (
     Candidate(("potential", "dissipation", "inertia"), 8),
     Candidate(("potential", "dissipation"), 16),
 )
+
+
+def inner_split(train: Trajectories) -> tuple[Trajectories, Trajectories]:
+    """Training data without every fourth trajectory or block, and those, to choose the size of a network by."""
+    present = np.unique(train.trajectory)
+    if len(present) < 2:
+        raise InputError("a part to choose by takes two trajectories or blocks to fit; record more motions")
+    return select(train, np.setdiff1d(present, present[1::4])), select(train, present[1::4])
 
 
 class ResidualFit(NamedTuple):
@@ -122,3 +131,9 @@ def fit_residual(
 
 def _typical(name: str, values: Float[np.ndarray, "N d"]) -> tuple[float, ...]:
     return tuple(float(f"{size:.3g}") if size > 0 else 1.0 for size in spread(name, values))
+
+
+def with_network(description: Description, added: ResidualFit) -> Description:
+    """Description of a model with its residual network."""
+    keywords = {key: value for key, value in description.items() if key not in ("name", "precision")}
+    return describe(f"{description['name']}-residual", precision="f64", **keywords, **added.settings)

@@ -21,7 +21,7 @@ from dln_jax.training.dynamics.methods.direct import refined_if_asked, training_
 from dln_jax.training.dynamics.options import TreeOptions
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.training.dynamics.task import Method, Refinement, Task
-from dln_jax.training.identification.motions import MotionSets, fit_by, prediction_times, spread_of
+from dln_jax.training.identification.motions import choose_window, prediction_times, refit, spread_of
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build, describe_for
 
@@ -104,19 +104,19 @@ def refined_by_motions(
         rotations=np.asarray(tree.rotations), positions=np.asarray(tree.positions),
         inertias=np.tile(BALL, (d, 1)), armature=np.full(d, BALL[-1]),
     )  # fmt: skip
-    motions = MotionSets(sets.train, sets.validation)
     with jax.enable_x64(True):
         rigid = make_rigid_tree(known, friction=friction, velocity_scale=scale)
         prior = rigid.init(jax.random.key(0))
         solution = identify(rigid, prior, sets.train, joints=needs.joints)
-        solution, _, choice = fit_by(
-            "motions", rigid, prior, solution, sets.train, motions, window, joints=needs.joints
-        )
+        if window is None:
+            window, line = choose_window("motions", rigid, prior, sets.train, sets.train, joints=needs.joints)
+            print(line)
+        solution, _ = refit("motions", rigid, prior, solution, sets.train, sets.train, window)
         fitted = parameters_of(solution.theta, prior)
         better = parameters._replace(
             **{name: value for name in parameters._fields if (value := getattr(fitted, name, None)) is not None}
         )
-        variance, model = spread_of(*motions), build(dict(description))
+        variance, model = spread_of(sets.train, sets.validation), build(dict(description))
 
         def seconds(held: Trajectories) -> tuple[float, float]:
             times = (prediction_times(model, tried, held, variance)[0] for tried in (parameters, better))
@@ -124,8 +124,6 @@ def refined_by_motions(
             return before, after
 
         validation, test = seconds(sets.validation), seconds(sets.test)
-    if choice.seconds:
-        print(choice.line)
     kept = validation[1] > validation[0]
     return Refinement(better if kept else parameters, kept, validation, test)
 

@@ -20,7 +20,8 @@ from dln_jax.data.splits import every
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.files import is_file, read_json, write_json
 from dln_jax.identification.identify import identify, parameters_of
-from dln_jax.identification.residual import fit_residual
+from dln_jax.identification.residual import fit_residual, inner_split, with_network
+from dln_jax.identification.rigid_tree import build_rigid_tree, describe_rigid_tree
 from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.linear import MOST_PARAMETERS, parameters_of_degree
 from dln_jax.learning.model_selection import Assessment, Candidate, FittedModel, Selection, select_model
@@ -37,8 +38,6 @@ from dln_jax.training.dynamics.options import NETWORK, Options, SelectionOptions
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.training.dynamics.task import Method, Task, method_of, planned
 from dln_jax.training.dynamics.verdict import definiteness_of
-from dln_jax.training.identification.additions import with_network
-from dln_jax.training.identification.task import Case, Sets, for_residual, with_description, with_terms
 from dln_jax.zoo.descriptions import Description, build, describe
 from dln_jax.zoo.run import load, save
 
@@ -226,17 +225,13 @@ def _by_name(name: str, options: Any, recorded: Recorded, folder: Path, mesh: Me
 
 def _rigid_tree(options: Any, recorded: Recorded, robot: Robot) -> FittedModel:
     """Identifies the robot's tree as the command `identify` does."""
-    needs = recorded.needs
-    train_set, validation, _ = recorded.sets
+    train_set = recorded.sets.train
     began = time.perf_counter()
-    stated = {"needs": needs, "tree": tree_to_json(robot.tree), "velocity_scale": needs.velocity_scale}
-    description = describe("rigid-tree", precision="f64", **stated)
-    sets = Sets(train_set, validation, blocks=False)
-    case = with_description(Case(robot, robot.tree.names, sets, description, None, None, None, (), ()))
-    case, _ = with_terms(options.velocity_scale, case)
-    solution = identify(case.model, case.known, train_set, joints=robot.tree.joints)
-    kept = parameters_of(solution.theta, case.known)
-    return _as_training(recorded, case.description, case.model, kept, time.perf_counter() - began)
+    description, _, _ = describe_rigid_tree(robot, recorded.needs, train_set, velocity_scale=options.velocity_scale)
+    model, known = build_rigid_tree(description, robot)
+    solution = identify(model, known, train_set, joints=robot.tree.joints)
+    kept = parameters_of(solution.theta, known)
+    return _as_training(recorded, description, model, kept, time.perf_counter() - began)
 
 
 def _with_network(recorded: Recorded, base: FittedModel | str | None, left: float) -> FittedModel | str:
@@ -250,7 +245,7 @@ def _with_network(recorded: Recorded, base: FittedModel | str | None, left: floa
     began = time.perf_counter()
     if base.outcome[0].kind == "learned-tree":
         base = _as_rigid(base, recorded)
-    train_set, chosen_by = for_residual(recorded.sets.train)
+    train_set, chosen_by = inner_split(recorded.sets.train)
     thin = -(-len(train_set.t) // MOST_SAMPLES)
     added = fit_residual(
         base.model,
