@@ -109,14 +109,8 @@ class Equations(NamedTuple):
         return self.triangles.shape[2] - 1
 
 
-class Regressor(NamedTuple):
-    """Phi and tau of a dataset, recomputed in chunks on every pass to save memory."""
-
-    passes: Callable[[], Iterator[tuple[np.ndarray, np.ndarray]]]
-    """Starts a pass: yields Phi [n, d, P] and tau [n, d] of n samples at a time."""
-    samples: int
-    joints: int
-    unknowns: int
+Regressor = Callable[[], Iterator[tuple[np.ndarray, np.ndarray]]]
+"""Starts a pass over the equations: yields Phi [n, d, P] and tau [n, d] of n samples at a time, computed anew."""
 
 
 def regressor_of(
@@ -152,22 +146,23 @@ def regressor_of(
                 require_linear(columns, theta, predicted)
                 yield columns if free is None else columns * free, tau
 
-    return Regressor(passes, len(data.tau), data.degrees_of_freedom, theta.size)
+    return passes
 
 
 def compressed(regressor: Regressor, weights: Float[np.ndarray, "N d"] | None = None) -> Equations:
     """Compresses the equations to triangular factors, with rows scaled by the square root of `weights`, if any."""
-    d, P = regressor.joints, regressor.unknowns
-    triangles, first = np.zeros((d, P + 1, P + 1)), 0
-    for columns, tau in regressor.passes():
+    triangles, first = np.zeros((0, 0, 0)), 0
+    for columns, tau in regressor():
         rows = np.concatenate([columns, tau[:, :, None]], axis=2)
         if weights is not None:
             rows = rows * np.sqrt(weights[first : first + len(tau), :, None])
+        if not first:
+            triangles = np.zeros((rows.shape[1], rows.shape[2], rows.shape[2]))
         first += len(tau)
-        for joint in range(d):
-            stacked = np.concatenate([triangles[joint], rows[:, joint]])
+        for joint, factor in enumerate(triangles):
+            stacked = np.concatenate([factor, rows[:, joint]])
             triangles[joint] = triangular_factor(stacked[:, :-1], stacked[:, -1])
-    return Equations(triangles, regressor.samples)
+    return Equations(triangles, first)
 
 
 def about(equations: Equations, theta: Float[np.ndarray, " P"]) -> Equations:
@@ -191,4 +186,4 @@ def squares(equations: Equations, theta: Float[np.ndarray, " P"]) -> Float[np.nd
 
 def residuals(regressor: Regressor, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, "N d"]:
     """tau - Phi theta of every sample."""
-    return np.concatenate([tau - columns @ theta for columns, tau in regressor.passes()])
+    return np.concatenate([tau - columns @ theta for columns, tau in regressor()])

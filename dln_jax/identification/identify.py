@@ -14,11 +14,10 @@ from dln_jax.identification.consistent import REGULARISATION, ConsistentFit, fit
 from dln_jax.identification.equations import Columns, columns_of, compressed, flat, regressor_of
 from dln_jax.identification.weighted import (
     ROUNDING,
-    ResidualStatistics,
     WeightedFit,
+    correlation_times,
     fit_robust,
     fit_weighted,
-    residual_statistics,
 )
 from dln_jax.learning.linear import design, unravelled
 from dln_jax.models.model import Model, Parameters
@@ -45,8 +44,8 @@ class Identification(NamedTuple):
     """Least-squares fit to the data; its bodies may be physically inconsistent."""
     seen: tuple[Determinacy, ...]
     """How these data determine every parameter."""
-    statistics: ResidualStatistics
-    """Statistics of the residuals of `fit`."""
+    correlation: Float[np.ndarray, " d"]
+    """Correlation time of every joint's residuals of `fit`, in samples."""
     consistent: ConsistentFit | None
     """Physically consistent parameters, if requested."""
 
@@ -114,15 +113,14 @@ def identify(
         noise = rough.noise
     compact = compressed(regressor, weights)
     fit = fit_weighted(compact, theta, noise=noise, rank_tolerance=rank_tolerance)
-    statistics = residual_statistics(equations.residuals(regressor, fit.theta), data.trajectory, fit.noise)
-    errors = {"noise": fit.noise, "correlation": statistics.correlation}
-    fit = fit_weighted(compact, theta, rank_tolerance=rank_tolerance, **errors)
+    correlation = correlation_times(equations.residuals(regressor, fit.theta), data.trajectory)
+    fit = fit_weighted(compact, theta, noise=fit.noise, correlation=correlation, rank_tolerance=rank_tolerance)
     bodies = None
     if consistent:
         triangle = equations.weighted(compact, fit.noise)
         bodies = fit_consistent(triangle, columns, theta, regularisation=regularisation)
     seen = seen_by(fit, base, structure)
-    return Identification(columns, theta, structure, base, fit, seen, statistics, bodies)
+    return Identification(columns, theta, structure, base, fit, seen, correlation, bodies)
 
 
 def seen_by(fit: WeightedFit, base: BaseParameters, structure: tuple[Determinacy, ...]) -> tuple[Determinacy, ...]:

@@ -5,7 +5,7 @@
 Directions that the data do not determine keep their prior values: of all theta that fit equally well, the solution is
 the nearest to the prior, in units of the columns' lengths. The noise is noise_j² = |residual_j|² / (N - share of the
 parameters that joint j determines); fit and noise alternate until the noise converges. The covariance of theta assumes
-independent errors of this size; of residuals correlated over T samples, T count as one (`residual_statistics`).
+independent errors of this size; of residuals correlated over T samples, T count as one (`correlation_times`).
 """
 
 from typing import NamedTuple
@@ -132,31 +132,12 @@ def _solved(
     return fit, np.sum(by_joint[:, :, :rank] ** 2, axis=(1, 2))
 
 
-class ResidualStatistics(NamedTuple):
-    """Statistics of the residuals of each joint [d]."""
-
-    rms: Float[np.ndarray, " d"]
-    """Root mean square, N m or N."""
-    share_beyond_three: Float[np.ndarray, " d"]
-    """Fraction of samples beyond three times the noise; 0.0027 for normal errors."""
-    excess_kurtosis: Float[np.ndarray, " d"]
-    """0 for normal errors; large for outliers."""
-    correlation: Float[np.ndarray, " d"]
-    """Correlation time in samples, 1 + 2 sum of autocorrelations; 1 for independent residuals."""
-
-
-def residual_statistics(
-    errors: Float[np.ndarray, "N d"], trajectory: np.ndarray, noise: Float[np.ndarray, " d"]
-) -> ResidualStatistics:
-    """Statistics of residuals relative to a noise level; they are correlated within trajectories only."""
-    square = np.mean(errors**2, axis=0)
-    kurtosis = np.mean(errors**4, axis=0) / np.where(square > 0, square, 1.0) ** 2 - 3
-    beyond = np.mean(abs(errors) > 3 * noise, axis=0)
-    return ResidualStatistics(np.sqrt(square), beyond, kurtosis, correlation_times(errors, trajectory))
-
-
 def correlation_times(errors: Float[np.ndarray, "N d"], trajectory: np.ndarray) -> Float[np.ndarray, " d"]:
-    """1 + 2 sum of autocorrelations, truncated at the first pair of lags whose sum is not positive (Geyer 1992)."""
+    """Correlation time of every joint's residuals in samples; 1 for independent ones.
+
+    1 + 2 sum of autocorrelations within trajectories, up to the first pair of lags whose sum is not positive (Geyer
+    1992).
+    """
     starts = np.flatnonzero(np.diff(trajectory)) + 1
     parts = np.split(errors, starts)
     longest = max(len(part) for part in parts)

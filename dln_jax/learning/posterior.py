@@ -62,7 +62,13 @@ def spectrum(
         rank_tolerance: as for `solvers.least_squares.solve`.
         negligible: as for `solvers.least_squares.solve`.
     """
-    triangles, samples = _triangles(rows, len(unit))
+    triangles: list[np.ndarray] = []
+    samples = 0
+    for columns, residual in rows:
+        samples += len(residual)
+        both = np.concatenate([columns, residual[:, :, None]], axis=2)
+        parts = [np.concatenate([*triangles[joint : joint + 1], both[:, joint]]) for joint in range(len(unit))]
+        triangles = [np.linalg.qr(part, mode="r") for part in parts]  # factors of the joints' [Phi_i r_i]
     squares = np.array([np.sum(triangle[:, -1] ** 2) for triangle in triangles])
     weighted = [triangle[:, :-1] / size for triangle, size in zip(triangles, unit, strict=True)]
     P = weighted[0].shape[1]
@@ -108,18 +114,6 @@ def left_out(
     predicted = U @ (inverse @ np.einsum("nip,ni->p", U, weighted))
     variance = np.einsum("nip,pq,niq->ni", along, inverse @ inner @ inverse, along, optimize=True)
     return (weighted + predicted) * unit, np.maximum(variance, 0.0)
-
-
-def _triangles(rows: Rows, d: int) -> tuple[list[np.ndarray], int]:
-    """Returns the triangular factors of the joints' [Phi_i r_i], and the number of samples."""
-    folded: list[np.ndarray] = []
-    samples = 0
-    for columns, residual in rows:
-        samples += len(residual)
-        both = np.concatenate([columns, residual[:, :, None]], axis=2)
-        parts = [np.concatenate([*folded[joint : joint + 1], both[:, joint]]) for joint in range(d)]
-        folded = [np.linalg.qr(part, mode="r") for part in parts]
-    return folded, samples
 
 
 def leading_directions(rows: Callable[[], Rows], unit: Float[np.ndarray, " d"], count: int) -> Float[np.ndarray, "P K"]:

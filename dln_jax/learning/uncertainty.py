@@ -120,25 +120,27 @@ def estimate(
         fitted = _along(known, _rows(model, parameters, thinned(train, MOST_SAMPLES), basis))[0]
         judged, residual = _along(known, _rows(model, parameters, held_out, basis))
         folds = [] if ridge != 0 else _left_out(model, parameters, train, known)
-    tried = [
-        _calibrated(known, size, judged, residual, held_out.trajectory, folds)
-        for size in (RIDGES if ridge is None else (ridge,))
-    ]
-    chosen = min(tried, key=lambda calibrated: calibrated.unlikeliness)
-    along = chosen.posterior.along
+    tried = []
+    for size in RIDGES if ridge is None else (ridge,):
+        of_ridge = posterior(known, size)
+        noise, inflation, unlikeliness = _calibrated(of_ridge, judged, residual, held_out.trajectory, folds)
+        tried.append((unlikeliness, size, of_ridge, noise, inflation))
+    _, chosen, fit, noise, inflation = min(tried, key=lambda calibrated: calibrated[0])
+    along = fit.along
     limits = np.concatenate([np.linalg.norm(part @ along, axis=2) for part in (fitted, judged)])
     factor, scale = (known.directions @ along) / known.scale[:, None], known.scale
-    undetermined = known.directions[:, known.sizes == 0] if chosen.ridge == 0 else np.zeros((len(scale), 0))
+    undetermined = known.directions[:, known.sizes == 0] if chosen == 0 else np.zeros((len(scale), 0))
     if basis is not None:
         factor, scale, undetermined = basis @ factor, np.ones(len(basis)), np.zeros((len(basis), 0))
     limit = np.maximum(margin * np.quantile(limits, quantile, axis=0), TINY)
     share = HARMLESS if ridge == 0 else 0.0
-    harmless = share * np.asarray(torque_scale(train), np.float64) / np.sqrt(np.maximum(chosen.inflation, TINY))
-    centre, reach = _reach(train, validation, quantile)
+    harmless = share * np.asarray(torque_scale(train), np.float64) / np.sqrt(np.maximum(inflation, TINY))
+    states, others = (np.concatenate([data.q, data.qd, data.qdd], axis=1) for data in (train, validation))
+    centre = (states.max(axis=0) + states.min(axis=0)) / 2
+    reach = np.quantile(abs(np.concatenate([states, others]) - centre), quantile, axis=0)
     reach = np.maximum(margin * reach, STILL)
     domain = Domain(np.maximum(limit, harmless), scale, undetermined, centre, reach, harmless)
-    uncertainty = Uncertainty(factor, chosen.noise, chosen.inflation, domain)
-    return Estimate(uncertainty, chosen.ridge, chosen.posterior.degrees_of_freedom, chosen.posterior.noise)
+    return Estimate(Uncertainty(factor, noise, inflation, domain), chosen, fit.degrees_of_freedom, fit.noise)
 
 
 def calibration(
@@ -177,7 +179,6 @@ def scatter(relative: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
         (1 + sqrt((1 + 1 / M) (var(s) - chance))) (t / z)²    where var(s) > chance
 
     The first factor is one standard deviation of a new motion's s above their mean. In the second, t and z are the
-    97.5 % quantiles of Student's distribution with M - 1 degrees of freedom and of the normal one: a variance that
     97.5 % quantiles of Student's distribution with M - 1 degrees of freedom and of the normal one, because M motions
     estimate the variance with few degrees of freedom. By chance alone the variance of s is 2 / n for normal
     residuals, and an estimate of it from M motions has the relative error e; chance is 2 / n (1 + 2 e) with
@@ -225,23 +226,14 @@ def thinned(data: Trajectories, most: int) -> Trajectories:
     return select_samples(data, np.unique(rows))
 
 
-class _Calibrated(NamedTuple):
-    posterior: Posterior
-    ridge: float
-    noise: np.ndarray
-    inflation: np.ndarray
-    unlikeliness: float
-
-
 def _calibrated(
-    known: Spectrum,
-    ridge: float,
+    fitted: Posterior,
     rows: np.ndarray,
     residual: np.ndarray,
     trajectory: np.ndarray,
     folds: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
-) -> _Calibrated:
-    fitted = posterior(known, ridge)
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Calibrated noise and inflation of every joint, and the mean negative log-likelihood."""
     variances = np.sum((rows @ fitted.along) ** 2, axis=2)
     parts = zip((residual, variances, trajectory), *folds, strict=True)
     residual, variances, trajectory = (np.concatenate(part) for part in parts)
@@ -252,7 +244,7 @@ def _calibrated(
     a, b, unlikeliness = np.array(joints).T
     expected = np.maximum(a * fitted.noise**2 + b * variances, TINY)
     factors = np.array([scatter(relative, trajectory) for relative in (residual / np.sqrt(expected)).T])
-    return _Calibrated(fitted, ridge, np.sqrt(factors * a) * fitted.noise, factors * b, float(unlikeliness.mean()))
+    return np.sqrt(factors * a) * fitted.noise, factors * b, float(unlikeliness.mean())
 
 
 def _left_out(
@@ -280,10 +272,3 @@ def _along(known: Spectrum, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     parts = [(columns / known.scale @ known.directions, residual) for columns, residual in rows]
     columns, residuals = zip(*parts, strict=True)
     return np.concatenate(columns), np.concatenate(residuals)
-
-
-def _reach(train: Trajectories, validation: Trajectories, quantile: float) -> tuple[np.ndarray, np.ndarray]:
-    """Middle of the range of (q, qd, qdd) in training, and the quantile of all data's distance from it, both [3 d]."""
-    states, others = (np.concatenate([data.q, data.qd, data.qdd], axis=1) for data in (train, validation))
-    centre = (states.max(axis=0) + states.min(axis=0)) / 2
-    return centre, np.quantile(abs(np.concatenate([states, others]) - centre), quantile, axis=0)

@@ -18,9 +18,8 @@ from jaxtyping import Float, Int
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import GAP
-from dln_jax.learning import motions
-from dln_jax.learning.measured_motions import MeasuredWindows, motion
-from dln_jax.learning.motions import nearest
+from dln_jax.learning import shooting
+from dln_jax.learning.shooting import MeasuredWindows, motion, nearest, phase_motion
 from dln_jax.mechanics.discrete import Torque
 from dln_jax.mechanics.dynamics import InverseForward
 from dln_jax.mechanics.equations import dynamics, flow
@@ -28,7 +27,7 @@ from dln_jax.metrics.rollouts import follow, valid_prediction_time
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError
 
-START_STEPS = 2 * motions.START_STEPS
+START_STEPS = 2 * shooting.START_STEPS
 """Gauss-Newton steps for the initial state of a prediction."""
 
 
@@ -173,7 +172,7 @@ def _predict(
 
     def moved(start, t, tau):
         if momenta:
-            return motions.motion(flow(energies), start, t, substeps=substeps)
+            return phase_motion(flow(energies), start, t, substeps=substeps)
         return motion(dynamics(energies), start, t, tau, torque=torque, substeps=substeps)
 
     def drift(states, t, tau):

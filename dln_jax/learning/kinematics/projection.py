@@ -71,13 +71,8 @@ class Structure(NamedTuple):
         return len(self.inertial) + len(self.joints) * (4 if self.friction else 1)
 
 
-class Samples(NamedTuple):
-    """States and torques, as arrays [N, d]."""
-
-    q: Any
-    qd: Any
-    qdd: Any
-    tau: Any
+Samples = tuple[Any, Any, Any, Any]
+"""q, qd, qdd and tau, as arrays [N, d]."""
 
 
 class Projection(NamedTuple):

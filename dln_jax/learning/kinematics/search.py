@@ -49,15 +49,6 @@ class Search(NamedTuple):
     """Deviation of the prior's positions, m."""
 
 
-class Searched(NamedTuple):
-    """Descents so far."""
-
-    descents: list[Descent]
-    """Final states, lowest loss first."""
-    starts: int
-    """Number of random starts; the others are moves of the best."""
-
-
 def search(
     structure: Structure,
     program: Program,
@@ -66,9 +57,11 @@ def search(
     settings: Search,
     *,
     until: float,
-    before: Searched = Searched([], 0),  # noqa: B008
-) -> Searched:
+    before: tuple[list[Descent], int] = ([], 0),
+) -> tuple[list[Descent], int]:
     """Descends from random starts, and from moves of the best, until enough descents agree on the lowest loss.
+
+    Returns the final states of all descents, lowest loss first, and the number of random starts among them.
 
     Args:
         program: descent of the structure, from `compiled`.
@@ -101,7 +94,7 @@ def search(
                 descents = _sorted([*descents, *pool.map(end, _turns(structure, best.frames, joints))])
                 if not descents[0].at.loss < (1 - ALIKE) * best.at.loss:
                     break
-    return Searched(descents, done)
+    return descents, done
 
 
 def agreeing(descents: list[Descent]) -> int:

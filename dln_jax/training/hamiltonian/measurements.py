@@ -27,8 +27,7 @@ from dln_jax.data.splits import (
 )
 from dln_jax.data.stated_tests import stated_test
 from dln_jax.data.trajectory_times import time_derivative
-from dln_jax.learning.measured_motions import MeasuredWindows, Noise
-from dln_jax.learning.motions import Weights
+from dln_jax.learning.shooting import MeasuredWindows, Noise, Weights
 from dln_jax.metrics.measured_predictions import cut_recordings, grid_places
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.types import InputError, Needs

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dln_jax.learning.kinematics.frames import Frames, displaced, free_directions, random_frames
-from dln_jax.learning.kinematics.projection import Samples, Structure, design, project
+from dln_jax.learning.kinematics.projection import Structure, design, project
 from dln_jax.mechanics.trees.description import make_tree
 from dln_jax.mechanics.trees.recursions import newton_euler
 
@@ -24,7 +24,7 @@ def problem():
     state = random.normal(size=(3, 40, 3))
     linear = random.normal(size=STRUCTURE.linear_count)
     frames = Frames(*map(jnp.asarray, frames))
-    return frames, Samples(*state, np.asarray(columns(frames, *state)) @ linear), linear
+    return frames, (*state, np.asarray(columns(frames, *state)) @ linear), linear
 
 
 @jax.jit
