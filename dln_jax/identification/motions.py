@@ -3,7 +3,7 @@
     minimise over theta, the delay, and for every window w over its start z_w and a constant torque e_w
 
         sum over samples |(q(t; z_w, theta) - q_measured) / noise_q|² + sum over windows |e_w / noise_tau|²
-            + |R (theta, -1)|²   (equations of the torques in units of their noise, `equations.weighted`)
+            + |R (theta, -1)|²   (equations of the torques in units of their noise, `equations.whiten`)
 
 The simulated motion is driven by tau(t - delay) + e_w. Starts and constant torques are eliminated window by window
 (Kaufman's derivative, `learning.shooting`). No acceleration is needed: forces that no log records, such as the

@@ -168,9 +168,7 @@ def _from_motors(motors: Rows | None, forces: Any) -> Any:
     return forces if motors is None else jnp.einsum("ji,njp->nip", np.asarray(motors), forces)
 
 
-def solve_terms(
-    terms: Terms, known: Known, design: Callable[..., Any], *, iterations: int = 50, negligible: float = 1e-12
-) -> SeparableSolution:
+def solve_terms(terms: Terms, known: Known, design: Callable[..., Any]) -> SeparableSolution:
     """Fits all unknowns; without nonlinear ones, a dummy without effect takes their place.
 
     Args:
@@ -178,10 +176,10 @@ def solve_terms(
     """
     d = known.tau.shape[1]
     start = [np.broadcast_to(_unknown(name, terms.start), d) for name in terms.learned]
-    settings = {"iterations": iterations, "negligible": negligible, "longest_step": LONGEST_STEP}
 
     def solve(unknowns: np.ndarray, signs: Any) -> SeparableSolution:
-        return solve_separable(design, unknowns, known._replace(signs=jnp.asarray(signs)), **settings)
+        now = known._replace(signs=jnp.asarray(signs))
+        return solve_separable(design, unknowns, now, negligible=1e-12, longest_step=LONGEST_STEP)
 
     signs = known.signs
     solution = solve(np.concatenate(start) if start else np.zeros(1), signs)
@@ -214,12 +212,6 @@ def shapes_of(learned: tuple[str, ...], unknowns: Any, d: int) -> dict[str, Any]
     return {
         name: inverse.get(name, jnp.exp)(unknowns[place * d : (place + 1) * d]) for place, name in enumerate(learned)
     }
-
-
-def slope_of(name: str, value: np.ndarray) -> np.ndarray:
-    """Derivative of a shape with respect to its unknown."""
-    slopes = {"sigmoid_shift": np.ones_like(value), "cooling": np.full_like(value, 1 / WARMER)}
-    return {**slopes, "load": value * (1 - value)}.get(name, value)
 
 
 class FrictionFit(NamedTuple):
@@ -256,8 +248,6 @@ def fit_friction(
     motors: Rows | None = None,
     coupled: tuple[Pair, ...] = (),
     noise: Any = None,
-    negligible: float = 1e-12,
-    iterations: int = 50,
 ) -> FrictionFit:
     """Fits the inertias, armature and friction of a tree to measured torques.
 
@@ -271,8 +261,6 @@ def fit_friction(
         cooling: whether viscous friction depends on the log's temperature; its mean becomes the reference.
         motors, coupled: as for `models.make_rigid_tree`.
         noise: standard deviations of the joints' torques [d], which weight the samples (default: the torque's own).
-        negligible: as for `learning.linear.fit_linear`.
-        iterations: largest number of Gauss-Newton iterations.
 
     Raises:
         InputError: unknown laws, constant torques, a noise <= 0, or cooling without viscous friction or a temperature.
@@ -281,8 +269,14 @@ def fit_friction(
     with jax.enable_x64(True):
         known = known_of(tree, data, terms, noise=noise)
         design = functools.partial(equations, terms)
-        solution = solve_terms(terms, known, design, iterations=iterations, negligible=negligible)
-        fitted = {k: np.asarray(v) for k, v in shapes_of(terms.learned, solution.nonlinear, d).items()}
+        solution = solve_terms(terms, known, design)
+        # Every shape depends on its own unknown alone, so that one derivative holds the slopes of all.
+        fitted, slopes = jax.jvp(
+            lambda unknowns: shapes_of(terms.learned, unknowns, d),
+            (jnp.asarray(solution.nonlinear),),
+            (jnp.ones(solution.nonlinear.shape),),
+        )
+        fitted, slopes = jax.tree.map(np.asarray, (fitted, slopes))
     left = solution.residuals.reshape(-1, d) * np.asarray(known.weights)
     shaped: dict[str, Any] = {name: _plain(value) for name, value in (terms.start._asdict() | fitted).items()}
     reference = reference_temperature(data) if cooling else None
@@ -297,7 +291,7 @@ def fit_friction(
         parameters=_parameters(solution.linear, terms, d),
         standard_errors=_parameters(errors[:count], terms, d),
         shape=fitted,
-        shape_errors={name: slope_of(name, fitted[name]) * deviation for name, deviation in by_shape.items()},
+        shape_errors={name: slopes[name] * deviation for name, deviation in by_shape.items()},
         rank=solution.rank,
         condition=solution.condition,
         reference_temperature=reference,
@@ -350,14 +344,14 @@ def choose_terms(
         data = in_blocks(data, BLOCKS)
     data = every(data, -(-len(data.t) // MOST_SAMPLES))
     segment, tried = segments(data), []
-    errors = cross_validated(tree, data, terms, segment)
+    errors = cross_validate(tree, data, terms, segment)
     for name, candidate in candidates:
         union = {
             part: tuple(dict.fromkeys((*getattr(terms, part), *getattr(candidate, part))))
             for part in ("laws", "learned", "coupled")
         }
         wider = terms._replace(**union)
-        trial = cross_validated(tree, data, wider, segment)
+        trial = cross_validate(tree, data, wider, segment)
         kept = significantly_better(trial, errors, margin=MARGIN)
         tried.append(TriedTerm(name, float(errors.mean()), float(trial.mean()), kept))
         if kept:
@@ -365,9 +359,7 @@ def choose_terms(
     return terms, tried
 
 
-def cross_validated(
-    tree: Tree, data: Trajectories, terms: Terms, segment: np.ndarray
-) -> Float[np.ndarray, " segments"]:
+def cross_validate(tree: Tree, data: Trajectories, terms: Terms, segment: np.ndarray) -> Float[np.ndarray, " segments"]:
     """Mean squared error of every segment, from fits to the folds without it."""
     present = np.unique(data.trajectory)
     folds = [np.isin(data.trajectory, present[fold::FOLDS]) for fold in range(FOLDS)]

@@ -51,15 +51,12 @@ class Posterior(NamedTuple):
     degrees_of_freedom: Float[np.ndarray, " d"]
 
 
-def spectrum(
-    rows: Rows, unit: Float[np.ndarray, " d"], *, rank_tolerance: float | None = None, negligible: float = 0.0
-) -> Spectrum:
+def spectrum(rows: Rows, unit: Float[np.ndarray, " d"], *, negligible: float = 0.0) -> Spectrum:
     """Computes the spectrum of all rows; takes about N d P² operations, and memory for d P² numbers.
 
     Args:
         rows: columns and residuals of the training data.
         unit: scales of the joints' residuals in the fit.
-        rank_tolerance: as for `solvers.least_squares.solve`.
         negligible: as for `solvers.least_squares.solve`.
     """
     triangles: list[np.ndarray] = []
@@ -78,12 +75,12 @@ def spectrum(
     scaled = [np.where(seen, triangle, 0.0) / scale for triangle in weighted]
     _, sizes, right = np.linalg.svd(np.linalg.qr(np.concatenate(scaled), mode="r"), full_matrices=True)
     sizes = np.concatenate([sizes, np.zeros(P - len(sizes))])
-    tolerance = np.finfo(np.float64).eps * max(samples * len(unit), P) if rank_tolerance is None else rank_tolerance
+    tolerance = np.finfo(np.float64).eps * max(samples * len(unit), P)
     sizes = np.where(sizes > tolerance * sizes.max(initial=0.0), sizes, 0.0)
     return Spectrum(scale, sizes, right.T, [triangle @ right.T for triangle in scaled], squares, unit, samples)
 
 
-def left_out(
+def leave_out(
     spectrum: Spectrum,
     noise: Float[np.ndarray, " d"],
     columns: Float[np.ndarray, "n d P"],

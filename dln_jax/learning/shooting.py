@@ -40,7 +40,7 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import GAP, window_indices
+from dln_jax.data.splits import window_indices
 from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by
 from dln_jax.mechanics.discrete import Torque, driven, torque_slopes
 from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainDynamics, PlainFlow
@@ -78,7 +78,7 @@ class Weights(NamedTuple):
     """Standard deviations of qd and pd, one number or 2 d; `None` leaves measured rates out."""
 
 
-def cut_windows(data: Trajectories, length: int, *, gap: float = GAP) -> Windows:
+def cut_windows(data: Trajectories, length: int) -> Windows:
     """Cuts consecutive windows of `length` samples; a window begins with the last sample of the one before.
 
     Windows lie within segments without a gap. The remainder of a segment is a shorter window.
@@ -88,7 +88,7 @@ def cut_windows(data: Trajectories, length: int, *, gap: float = GAP) -> Windows
     """
     if data.p is None:
         raise InputError("the data have no p; add momenta, or rates in their place (per unit of mass)")
-    indices, weight = window_indices(data, length, gap=gap)
+    indices, weight = window_indices(data, length)
     state = np.concatenate([data.q, data.p], axis=1)[indices]
     rate = None if data.pd is None else np.concatenate([data.qd, data.pd], axis=1)[indices]
     t = data.t[indices]
@@ -115,10 +115,10 @@ def window_residual(
         q, p = jnp.split(states, 2, axis=1)
         rates = jnp.concatenate(jax.vmap(field.rates)(q, p), axis=1)
         errors.append((rates - rate[0]) / jnp.asarray(weights.rate, start.dtype))
-    return weighted(weight, *errors)
+    return weigh(weight, *errors)
 
 
-def weighted(weight: Array, *errors: Array) -> Array:
+def weigh(weight: Array, *errors: Array) -> Array:
     """Concatenates errors [T, n] of a window, weighted so that their squares sum to a mean over its samples."""
     size = jnp.sqrt(weight / jnp.sum(weight))[:, None]
     return jnp.concatenate([jnp.ravel(size * error) for error in errors])
@@ -193,7 +193,7 @@ def without_start(frozen: Callable[[Array], Array], residual: Callable[[Array], 
         residual: the same function, differentiable in the parameters.
         start: initial value.
     """
-    start, slope = jax.lax.stop_gradient(_descended(frozen, start, START_STEPS))
+    start, slope = jax.lax.stop_gradient(_descend(frozen, start, START_STEPS))
     left = residual(start)
     change = left - jax.lax.stop_gradient(left)  # zero, with the derivative of `left`
     return left - slope @ solve(slope.T @ slope, slope.T @ change)
@@ -201,10 +201,10 @@ def without_start(frozen: Callable[[Array], Array], residual: Callable[[Array], 
 
 def nearest(residual: Callable[[Array], Array], start: Array, *, steps: int = START_STEPS) -> Array:
     """Returns a start of lower residual, by steps of Gauss-Newton."""
-    return _descended(residual, start, steps)[0]
+    return _descend(residual, start, steps)[0]
 
 
-def _descended(residual: Callable[[Array], Array], start: Array, steps: int) -> tuple[Array, Array]:
+def _descend(residual: Callable[[Array], Array], start: Array, steps: int) -> tuple[Array, Array]:
     """Returns the start after some steps, and dr/dz at the beginning of the last one."""
     linearised = jax.jacfwd(lambda start: (residual(start),) * 2, has_aux=True)
 
@@ -251,13 +251,13 @@ class Gauge(NamedTuple):
     """Mean of its diagonal there, kg m² or kg."""
 
 
-def cut_measured_windows(data: Trajectories, length: int, *, gap: float = GAP) -> MeasuredWindows:
+def cut_measured_windows(data: Trajectories, length: int) -> MeasuredWindows:
     """Cuts consecutive windows of `length` samples within segments without a gap.
 
     Raises:
         InputError: a length below 2, or no two samples without a gap between them.
     """
-    indices, weight = window_indices(data, length, gap=gap)
+    indices, weight = window_indices(data, length)
     t = data.t[indices]
     return MeasuredWindows(t - t[:, :1], data.q[indices], data.qd[indices], data.tau[indices], weight)
 
@@ -377,5 +377,5 @@ def _measured_residual(
     errors = [(states[:, :d] - q) / jnp.asarray(noise.q)]
     if noise.qd is not None:
         errors.append((states[:, d:] - qd) / jnp.asarray(noise.qd))
-    residual = weighted(weight, *errors)
+    residual = weigh(weight, *errors)
     return residual if noise.tau is None else jnp.concatenate([residual, push / jnp.asarray(noise.tau)])

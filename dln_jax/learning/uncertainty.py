@@ -15,7 +15,7 @@ Held-out motions therefore scale both parts of the variance of every joint,
 
 The simplest form is kept unless another is better by more than half the logarithm of the effective samples per extra
 factor (Schwarz 1978): a few seconds that agree with the training change nothing. The held-out motions are those of the
-validation and, for least squares, also those of the training, each as if it had been left out (`posterior.left_out`).
+validation and, for least squares, also those of the training, each as if it had been left out (`posterior.leave_out`).
 Both parts are then multiplied by the `scatter` of the motions, because model errors differ between motions.
 
 A model that is linear in its parameters is right wherever the data determine its torque, even far from the data. No
@@ -34,7 +34,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select, select_samples
 from dln_jax.learning.linear import design, design_chunks
 from dln_jax.learning.objectives import torque_scale
-from dln_jax.learning.posterior import Posterior, Rows, Spectrum, leading_directions, left_out, posterior, spectrum
+from dln_jax.learning.posterior import Posterior, Rows, Spectrum, leading_directions, leave_out, posterior, spectrum
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.uncertainty import Domain, Uncertainty
 from dln_jax.solvers.normal_equations import count
@@ -78,7 +78,6 @@ def estimate(
     *,
     ridge: float | None = None,
     unit: Float[np.ndarray, " d"] | None = None,
-    rank_tolerance: float | None = None,
     negligible: float = 0.0,
     quantile: float = 0.999,
     margin: float = 1.25,
@@ -91,7 +90,6 @@ def estimate(
         validation: other trajectories, used for model selection at most.
         ridge: dimensionless, as in `learning.posterior`; 0 for least squares; by default chosen by validation.
         unit: scales of the joints' residuals in the fit, N m or N; by default `torque_scale`.
-        rank_tolerance: as for `solvers.least_squares.solve`.
         negligible: the value that `fit_linear` used.
         quantile: quantile of the data that sets the thresholds of `out_of_distribution`.
         margin: factor on the thresholds: held-out motions of the same kind go a little further.
@@ -109,21 +107,19 @@ def estimate(
         parameters = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), parameters)
         if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(parameters)):
             raise InputError("the parameters are not finite; train again")
-        held_out = thinned(validation, MOST_SAMPLES)
+        held_out = thin(validation, MOST_SAMPLES)
         if ridge == 0 or count(parameters) <= MOST_PARAMETERS:
             basis = None
         else:
-            basis = leading_directions(lambda: _rows(model, parameters, thinned(train, MOST_SAMPLES)), unit, DIRECTIONS)
-        known = spectrum(
-            _rows(model, parameters, train, basis), unit, rank_tolerance=rank_tolerance, negligible=negligible
-        )
-        fitted = _along(known, _rows(model, parameters, thinned(train, MOST_SAMPLES), basis))[0]
+            basis = leading_directions(lambda: _rows(model, parameters, thin(train, MOST_SAMPLES)), unit, DIRECTIONS)
+        known = spectrum(_rows(model, parameters, train, basis), unit, negligible=negligible)
+        fitted = _along(known, _rows(model, parameters, thin(train, MOST_SAMPLES), basis))[0]
         judged, residual = _along(known, _rows(model, parameters, held_out, basis))
-        folds = [] if ridge != 0 else _left_out(model, parameters, train, known)
+        folds = [] if ridge != 0 else _leave_out(model, parameters, train, known)
     tried = []
     for size in RIDGES if ridge is None else (ridge,):
         of_ridge = posterior(known, size)
-        noise, inflation, unlikeliness = _calibrated(of_ridge, judged, residual, held_out.trajectory, folds)
+        noise, inflation, unlikeliness = _calibrate(of_ridge, judged, residual, held_out.trajectory, folds)
         tried.append((unlikeliness, size, of_ridge, noise, inflation))
     _, chosen, fit, noise, inflation = min(tried, key=lambda calibrated: calibrated[0])
     along = fit.along
@@ -220,13 +216,13 @@ def effective_samples(residual: Float[np.ndarray, " N"], trajectory: np.ndarray)
     return len(residual) / total
 
 
-def thinned(data: Trajectories, most: int) -> Trajectories:
+def thin(data: Trajectories, most: int) -> Trajectories:
     """Returns at most `most` samples, evenly spaced."""
     rows = np.linspace(0, len(data.t) - 1, min(most, len(data.t))).round().astype(int)
     return select_samples(data, np.unique(rows))
 
 
-def _calibrated(
+def _calibrate(
     fitted: Posterior,
     rows: np.ndarray,
     residual: np.ndarray,
@@ -247,7 +243,7 @@ def _calibrated(
     return np.sqrt(factors * a) * fitted.noise, factors * b, float(unlikeliness.mean())
 
 
-def _left_out(
+def _leave_out(
     model: Model, parameters: Parameters, train: Trajectories, known: Spectrum
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Residuals, variances and trajectories of training data as if held out, a fold of trajectories at a time."""
@@ -258,7 +254,7 @@ def _left_out(
     for indices in np.array_split(present, min(FOLDS, len(present))):
         data = select(train, indices)
         columns, residual = _along(known, _rows(model, parameters, data))
-        folds.append((*left_out(known, noise, columns, residual), data.trajectory))
+        folds.append((*leave_out(known, noise, columns, residual), data.trajectory))
     return folds
 
 

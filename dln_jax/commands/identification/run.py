@@ -23,6 +23,7 @@ from dln_jax.figures.joints import friction_curves
 from dln_jax.figures.torques import torque_by_joint
 from dln_jax.files import write_bytes, write_json
 from dln_jax.identification.identify import identify, parameters_of
+from dln_jax.identification.motions import MotionFit
 from dln_jax.identification.report import base_rows, findings, parameter_rows, summary, text
 from dln_jax.identification.residual import inner_split
 from dln_jax.identification.rigid_tree import at_reference, build_rigid_tree, describe_rigid_tree
@@ -129,6 +130,7 @@ def run(options: Arguments) -> None:
         sources = {"file": solution.known, "least_squares": solution.fit.theta, FITTED: solution.theta}
         predicted = {name: predict(parameters_of(theta, known), test) for name, theta in sources.items()}
         torques = {name: torque for name, (torque, _) in predicted.items()}
+        errors = {name: normalised_error(torque, test.tau) for name, torque in torques.items()}
         metrics: dict[str, float | int] = {
             "parameters": len(solution.theta),
             "base_parameters": len(solution.base.words),
@@ -136,7 +138,6 @@ def run(options: Arguments) -> None:
             "condition": solution.fit.condition,
             "identify_seconds": seconds,
         }
-        errors = {name: normalised_error(torque, test.tau) for name, torque in torques.items()}
         for name, error in errors.items():
             prefix = "" if name == FITTED else f"{name}_"
             metrics[f"{prefix}torque_mse"] = float(np.mean(np.sum((torques[name] - test.tau) ** 2, axis=1)))
@@ -145,33 +146,20 @@ def run(options: Arguments) -> None:
         metrics |= {f"noise_joint_{k + 1}": float(value) for k, value in enumerate(solution.fit.noise)}
         if solution.consistent is not None:
             metrics["consistent_iterations"] = solution.consistent.iterations
-        whole = False
+        times: dict[str, float] = {}
         if motions:
-            times = {"predicted_seconds": 0.0}
             for name, theta in {"vpt_seconds": solution.theta, "by_torques_vpt_seconds": by_torques}.items():
                 tried = parameters_of(theta, known)
                 each, times["predicted_seconds"] = prediction_times(model, tried, motions[1], spread_of(*motions))
                 times[name] = float(np.mean(each))
-            told = (
-                f"held-out motions: predicted for {times['vpt_seconds']:.3g} s of {times['predicted_seconds']:.3g} s, "
-                f"by torques alone for {times['by_torques_vpt_seconds']:.3g} s (mean valid prediction time)"
-            )
-            metrics |= times
-            if by_motions is None:
-                of_motions.append(told)
-            else:
-                metrics |= {"delay_seconds": by_motions.delay, "rounds": by_motions.rounds}
-                metrics |= {"motion_rms_before": by_motions.before, "motion_rms": by_motions.after}
-                of_motions += [
-                    f"by {options.by}: windows are off by {by_motions.after:.3g} of their noise (before: "
-                    f"{by_motions.before:.3g}; {by_motions.rounds} rounds)",
-                    told,
-                    f"motions follow the logged torques by {1e3 * by_motions.delay:.1f} ms; the model has no delay",
-                ]
-                if not by_motions.converged:
-                    of_motions.append("the fit to motions did not converge; record motions closer to the use")
-                whole = bool(np.isclose(times["vpt_seconds"], times["predicted_seconds"]))
-        filtered_torque = filtered is not None and filtered.filtered_torque
+            of_motions += motion_lines(options.by, by_motions, times)
+        whole = False
+        if by_motions is not None:
+            times |= {"delay_seconds": by_motions.delay, "rounds": by_motions.rounds}
+            times |= {"motion_rms_before": by_motions.before, "motion_rms": by_motions.after}
+            whole = bool(np.isclose(times["vpt_seconds"], times["predicted_seconds"]))
+        metrics |= times
+        noise = None if filtered is None or not filtered.filtered_torque else filtered.noise_tau
         verdict, of_verdict = judge_robot(
             solution,
             known,
@@ -181,7 +169,7 @@ def run(options: Arguments) -> None:
             test,
             torques,
             names,
-            noise=filtered.noise_tau if filtered_torque else torque_noise(train),
+            noise=torque_noise(train) if noise is None else noise,
             causes=causes,
             robust=options.robust,
             whole=whole,
@@ -277,6 +265,22 @@ def stated_motors(options: Arguments, d: int) -> tuple[Rows | None, tuple[Pair, 
     except InputError as error:
         raise InputError(f"--{error}") from None
     return rows, tuple(pairs)
+
+
+def motion_lines(by: str, fit: MotionFit | None, times: dict[str, float]) -> list[str]:
+    """Lines on the fit to motions, if there is one, and on predictions of held-out motions."""
+    told = (
+        f"held-out motions: predicted for {times['vpt_seconds']:.3g} s of {times['predicted_seconds']:.3g} s, by "
+        f"torques alone for {times['by_torques_vpt_seconds']:.3g} s (mean valid prediction time)"
+    )
+    if fit is None:
+        return [told]
+    lines = [
+        f"by {by}: windows are off by {fit.after:.3g} of their noise (before: {fit.before:.3g}; {fit.rounds} rounds)",
+        told,
+        f"motions follow the logged torques by {1e3 * fit.delay:.1f} ms; the model has no delay",
+    ]
+    return lines if fit.converged else [*lines, "the fit to motions did not converge; record motions closer to the use"]
 
 
 def predictor(model: Model) -> Predict:

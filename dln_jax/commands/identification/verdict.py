@@ -49,7 +49,7 @@ def judge_robot(
     torques: dict[str, np.ndarray],
     names: tuple[str, ...],
     *,
-    noise: np.ndarray,
+    noise: np.ndarray | None,
     causes: tuple[str, ...],
     robust: bool,
     whole: bool,
@@ -88,10 +88,13 @@ def judge_robot(
         thin = every(train, -(-len(train.t) // MOST))
         motor = shared_motor(thin.tau - predict(mine, thin)[0], thin.qd)
         if motor is not None:
-            rates = ";".join(",".join(f"{entry:g}" for entry in row) for row in motor.rates(d))
+            joint, other, ratio, explained = motor
+            S = np.eye(d)
+            S[joint, other] = ratio
+            rows = ";".join(",".join(f"{entry:g}" for entry in row) for row in S)
             remedy = (
-                f"friction of a motor that turns with {names[motor.joint]} and {motor.ratio:g} times "
-                f"{names[motor.other]} would explain {motor.share:.0%} of what is left in both: try --motors '{rates}'"
+                f"friction of a motor that turns with {names[joint]} and {ratio:g} times {names[other]} would explain "
+                f"{explained:.0%} of what is left in both: try --motors '{rows}'"
             )
             verdict = verdict._replace(remedy=f"{remedy}; else {verdict.remedy}")
     share = spikes(train.tau).mean(axis=0)

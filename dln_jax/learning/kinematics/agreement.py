@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from dln_jax.learning.kinematics.frames import Frames, mirrored
+from dln_jax.learning.kinematics.frames import Frames, mirror_image
 from dln_jax.learning.kinematics.projection import LENGTH, Structure
 
 SAME_ANGLE, SAME_LENGTH = np.radians(5.0), 0.03
@@ -66,7 +66,7 @@ def difference(first: Frames, second: Frames, structure: Structure) -> Differenc
     gravity = structure.acceleration > 0
     one = lines_of(first, structure.parents, gravity=gravity)
     turning = np.array([kind == "revolute" for kind in structure.joints])
-    others = second, mirrored(second, structure.parents, structure.joints)
+    others = second, mirror_image(second, structure.parents, structure.joints)
     offsets = [_aligned(one, lines_of(other, structure.parents, gravity=gravity), turning) for other in others]
     return min(offsets, key=lambda off: off.size)
 

@@ -24,7 +24,7 @@ from dln_jax.learning.kinematics.projection import (
     design,
     inertias_of,
 )
-from dln_jax.learning.kinematics.search import ALIKE, Search, agreeing, search
+from dln_jax.learning.kinematics.search import ALIKE, Search, count_agreeing, search
 from dln_jax.learning.linear import design_chunks
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.models.serial_tree import SerialTreeParameters, make_serial_tree, rotation_vector
@@ -124,17 +124,18 @@ def fit_tree(
 
         def finished(descent: Descent) -> tuple[Descent, least_squares.LeastSquaresSolution, np.ndarray, np.ndarray]:
             """The refined descent, its linear solution, and its mean squared errors by joint on both sets."""
-            state, unit = _refined(program, structure, descent, every, scale, settings)
-            solution = _solved(columns, state, unit, train, rank_tolerance)
-            errors = [_joint_errors(columns, state.frames, solution.x, part) for part in (train, validation or train)]
-            return state, solution, *errors
+            state, unit = _refine(program, structure, descent, every, scale, settings)
+            solution = _solve(columns, state, unit, train, rank_tolerance)
+            trained, judged = (
+                _joint_errors(columns, state.frames, solution.x, part) for part in (train, validation or train)
+            )
+            return state, solution, trained, judged
 
         while True:
             searched = search(structure, program, some, scale, wanted, until=until, before=searched)
             descents, starts = searched
-            report(
-                f"{len(descents)} descents, {agreeing(descents)} to the lowest loss, {float(descents[0].at.loss):.3g}"
-            )
+            lowest = float(descents[0].at.loss)
+            report(f"{len(descents)} descents, {count_agreeing(descents)} to the lowest loss, {lowest:.3g}")
             finalists = _finalists(descents, validation)
             candidates = [finished(descent) for descent in finalists]
             errors = [float(np.sum(judged / scale**2)) for *_, judged in candidates]
@@ -151,7 +152,7 @@ def fit_tree(
             if (twin is not None and twin.same) or starts >= settings.starts or time.perf_counter() > until:
                 break
             # One more wave of starts, however many agree already.
-            wanted = settings._replace(agreement=agreeing(descents) + 1)
+            wanted = settings._replace(agreement=count_agreeing(descents) + 1)
         losses = np.array([float(descent.at.loss) for descent in descents])
         parameters = _parameters(structure, state.frames, solution.x)
     return TreeFit(
@@ -164,7 +165,7 @@ def fit_tree(
         rank=solution.rank,
         condition=solution.condition,
         losses=losses,
-        agreeing=agreeing(descents),
+        agreeing=count_agreeing(descents),
         agreement=settings.agreement,
         twin=twin,
         seconds=time.perf_counter() - began,
@@ -194,7 +195,7 @@ def _finalists(descents: list[Descent], validation: Trajectories | None) -> list
     return kept
 
 
-def _refined(
+def _refine(
     program: Program,
     structure: Structure,
     state: Descent,
@@ -211,7 +212,7 @@ def _refined(
     return state, unit
 
 
-def _solved(
+def _solve(
     columns: Callable, state: Descent, unit: Float[np.ndarray, " d"], data: Trajectories, rank_tolerance: float
 ) -> least_squares.LeastSquaresSolution:
     """Solves for the linear parameters of known frames on all data, by singular values."""

@@ -67,13 +67,13 @@ def free_directions(parents: Sequence[int], joints: Sequence[JointKind]) -> np.n
     return np.array(places)
 
 
-def displaced(frames: Frames, step: Float[Array, "d 6"]) -> Frames:
+def displace(frames: Frames, step: Float[Array, "d 6"]) -> Frames:
     """Rotates frames by the vectors step[:, :3], rad, and moves them by step[:, 3:], m, both in their own axes."""
     positions = frames.positions + jnp.einsum("iab,ib->ia", frames.rotations, step[:, 3:])
     return Frames(frames.rotations @ jax.vmap(rotation)(step[:, :3]), positions)
 
 
-def turned_round(frames: Frames, parents: Sequence[int], joint: int) -> Frames:
+def turn_round(frames: Frames, parents: Sequence[int], joint: int) -> Frames:
     """Returns the same arm at q = 0 with one joint's direction of motion reversed.
 
     Where gravity dominates, torques hardly distinguish the two arms, and descents end at either.
@@ -87,8 +87,8 @@ def turned_round(frames: Frames, parents: Sequence[int], joint: int) -> Frames:
     return Frames(rotations, positions)
 
 
-def mirrored(frames: Frames, parents: Sequence[int], joints: Sequence[JointKind]) -> Frames:
-    """Returns the mirror image: it moves in the same way under the same torques if the inertias are mirrored too.
+def mirror_image(frames: Frames, parents: Sequence[int], joints: Sequence[JointKind]) -> Frames:
+    """Returns the mirror image: it moves in the same way under the same torques if the inertias are mirror_image too.
 
     Reflecting x in every frame reverses the rotation of revolute joints; reversing y and z of their links restores it.
     """

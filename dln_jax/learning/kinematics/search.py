@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.learning.kinematics.frames import Frames, random_frames, rough_frames, turned_round
+from dln_jax.learning.kinematics.frames import Frames, random_frames, rough_frames, turn_round
 from dln_jax.learning.kinematics.projection import Descent, Program, Samples, Structure, descend
 from dln_jax.types import require_positive, require_seed
 
@@ -86,10 +86,10 @@ def search(
         while wave := list(itertools.islice(starts, WAVE)):
             descents = _sorted([*descents, *pool.map(end, wave)])
             done += len(wave)
-            if agreeing(descents) >= settings.agreement or time.perf_counter() > until:
+            if count_agreeing(descents) >= settings.agreement or time.perf_counter() > until:
                 break
         for joints in (1, 2):
-            while agreeing(descents) < settings.agreement and time.perf_counter() < until:
+            while count_agreeing(descents) < settings.agreement and time.perf_counter() < until:
                 best = descents[0]
                 descents = _sorted([*descents, *pool.map(end, _turns(structure, best.frames, joints))])
                 if not descents[0].at.loss < (1 - ALIKE) * best.at.loss:
@@ -97,7 +97,7 @@ def search(
     return descents, done
 
 
-def agreeing(descents: list[Descent]) -> int:
+def count_agreeing(descents: list[Descent]) -> int:
     """Number of descents that ended at the lowest loss."""
     return sum(float(descent.at.loss) <= (1 + ALIKE) * float(descents[0].at.loss) for descent in descents)
 
@@ -115,7 +115,7 @@ def _starts(structure: Structure, settings: Search, first: int) -> Iterator[Fram
 def _turns(structure: Structure, frames: Frames, joints: int) -> Iterable[Frames]:
     """Yields the frames with every combination of this number of joints reversed."""
     for chosen in itertools.combinations(range(len(structure.joints)), joints):
-        yield functools.reduce(lambda frames, joint: turned_round(frames, structure.parents, joint), chosen, frames)
+        yield functools.reduce(lambda frames, joint: turn_round(frames, structure.parents, joint), chosen, frames)
 
 
 def _sorted(descents: list[Descent]) -> list[Descent]:

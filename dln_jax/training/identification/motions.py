@@ -89,8 +89,8 @@ def refit(
     if by == "both":
         # Samples with correlated residuals count once, as in the standard errors.
         noise = solution.fit.noise * np.sqrt(solution.correlation)
-        compact = equations.compressed(equations.regressor_of(model, parameters_of(solution.theta, known), train))
-        torques = equations.weighted(compact, noise)
+        compact = equations.compress(equations.regressor_of(model, parameters_of(solution.theta, known), train))
+        torques = equations.whiten(compact, noise)
     fit = fit_motions(
         model,
         solution.columns,
@@ -126,7 +126,7 @@ def choose_window(
         rest = np.delete(present, slice(fold, None, FOLDS))
         inner, moved, held = select(train, rest), select(motions, rest), select(motions, present[fold::FOLDS])
         solution = identify(model, known, inner, **options)
-        thetas = {None: solution.theta}
+        thetas: dict[float | None, np.ndarray] = {None: solution.theta}
         for window in [window for window in WINDOWS if window in times]:
             try:
                 thetas[window] = refit(by, model, known, solution, inner, moved, window, reweightings=0)[0].theta
