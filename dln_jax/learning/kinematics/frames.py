@@ -37,6 +37,16 @@ class Frames(NamedTuple):
     """[d, 3], m."""
 
 
+class KinematicPrior(NamedTuple):
+    """Frames and their deviations."""
+
+    frames: Frames
+    angle: float = float(np.radians(ROUGHNESS["angle_degrees"]))
+    """Deviation of the axes, rad."""
+    length: float = ROUGHNESS["length"]
+    """Deviation of the positions, m."""
+
+
 def random_frames(d: int, random: np.random.Generator) -> Frames:
     """Returns frames with random orientations and positions."""
     rotations, _ = np.linalg.qr(random.normal(size=(d, 3, 3)))
@@ -44,14 +54,13 @@ def random_frames(d: int, random: np.random.Generator) -> Frames:
     return Frames(rotations, REACH * random.normal(size=(d, 3)))
 
 
-def rough_frames(kinematic_prior: Frames, random: np.random.Generator, *, angle: float, length: float) -> Frames:
-    """Perturbs prior frames: rotates them by `angle`, rad, about random axes, and moves them by `length`, m."""
-    directions = random.normal(size=(2, *np.shape(kinematic_prior.positions)))
+def rough_frames(prior: KinematicPrior, random: np.random.Generator) -> Frames:
+    """Perturbs prior frames by their deviations: rotates them about random axes, and moves them."""
+    rotations, positions = map(np.asarray, prior.frames)
+    directions = random.normal(size=(2, *positions.shape))
     directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    turns = np.asarray(jax.vmap(rotation)(jnp.asarray(angle * directions[0])))
-    return Frames(
-        np.asarray(kinematic_prior.rotations) @ turns, np.asarray(kinematic_prior.positions) + length * directions[1]
-    )
+    turns = np.asarray(jax.vmap(rotation)(jnp.asarray(prior.angle * directions[0])))
+    return Frames(rotations @ turns, positions + prior.length * directions[1])
 
 
 def free_directions(parents: Sequence[int], joints: Sequence[JointKind]) -> np.ndarray:
@@ -100,16 +109,6 @@ def mirror_image(frames: Frames, parents: Sequence[int], joints: Sequence[JointK
     ]
     positions = [turn @ mirror @ p for turn, p in zip(before, frames.positions, strict=True)]
     return Frames(np.array(rotations), np.array(positions))
-
-
-class KinematicPrior(NamedTuple):
-    """Frames and their deviations."""
-
-    frames: Frames
-    angle: float = float(np.radians(ROUGHNESS["angle_degrees"]))
-    """Deviation of the axes, rad."""
-    length: float = ROUGHNESS["length"]
-    """Deviation of the positions, m."""
 
 
 def frames_of_axes(

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.learning.kinematics.frames import Frames, random_frames, rough_frames, turn_round
+from dln_jax.learning.kinematics.frames import Frames, KinematicPrior, random_frames, rough_frames, turn_round
 from dln_jax.learning.kinematics.projection import Descent, Program, Samples, Structure, descend
 from dln_jax.types import require_positive, require_seed
 
@@ -41,12 +41,8 @@ class Search(NamedTuple):
     """Whether to search until two descents end at the same arm, with the same validation error."""
     seed: int = 0
     threads: int = 2
-    kinematic_prior: Frames | None = None
-    """Kinematic prior: frames near which to start, for example from a drawing with link lengths and rough axes."""
-    prior_angle: float = 0.5
-    """Deviation of the prior's axes, rad."""
-    prior_length: float = 0.05
-    """Deviation of the prior's positions, m."""
+    kinematic_prior: KinematicPrior | None = None
+    """Frames near which to start, for example from a drawing with link lengths and rough axes (default: anywhere)."""
 
 
 def search(
@@ -72,7 +68,9 @@ def search(
         InputError: a setting out of range.
     """
     counts = {name: getattr(settings, name) for name in ("starts", "agreement", "iterations", "seconds", "threads")}
-    require_positive(**counts, prior_angle=settings.prior_angle, prior_length=settings.prior_length)
+    require_positive(**counts)
+    if settings.kinematic_prior is not None:
+        require_positive(angle=settings.kinematic_prior.angle, length=settings.kinematic_prior.length)
     require_seed(settings.seed)
 
     def end(frames: Frames) -> Descent:
@@ -103,13 +101,12 @@ def count_agreeing(descents: list[Descent]) -> int:
 
 
 def _starts(structure: Structure, settings: Search, first: int) -> Iterator[Frames]:
-    prior = settings.kinematic_prior
     for index in range(first, settings.starts):
         random = np.random.default_rng([settings.seed, index])
-        if prior is None:
+        if settings.kinematic_prior is None:
             yield random_frames(len(structure.joints), random)
         else:
-            yield rough_frames(prior, random, angle=settings.prior_angle, length=settings.prior_length)
+            yield rough_frames(settings.kinematic_prior, random)
 
 
 def _turns(structure: Structure, frames: Frames, joints: int) -> Iterable[Frames]:

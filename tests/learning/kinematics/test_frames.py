@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dln_jax.learning.kinematics.frames import (
+    KinematicPrior,
     mirror_image,
     random_frames,
     rough_frames,
@@ -56,7 +57,7 @@ def test_the_mirror_image_takes_the_same_torques(frames):
 
 
 def test_rough_frames_are_as_far_off_as_is_said(frames):
-    found = rough_frames(frames, np.random.default_rng(3), angle=0.3, length=0.1)
+    found = rough_frames(KinematicPrior(frames, 0.3, 0.1), np.random.default_rng(3))
     np.testing.assert_allclose(np.linalg.norm(found.positions - frames.positions, axis=1), 0.1, atol=1e-12)
     between = np.swapaxes(frames.rotations, 1, 2) @ found.rotations
     np.testing.assert_allclose(np.trace(between, axis1=1, axis2=2), 1 + 2 * np.cos(0.3), atol=1e-12)

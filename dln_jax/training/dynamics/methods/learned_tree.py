@@ -51,16 +51,8 @@ def plan(options: TreeOptions, kind: str, recorded: Recorded, objective: Objecti
 
 def fit(task: Task, options: Any, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
     """Searches joint frames by Gauss-Newton, from random starts or near a prior, and eliminates everything else."""
-    needs, kinematic_prior = needs_of_tree(task.needs), task.recorded.kinematic_prior
-    near = (
-        {}
-        if kinematic_prior is None
-        else {
-            "kinematic_prior": kinematic_prior.frames,
-            "prior_angle": kinematic_prior.angle,
-            "prior_length": kinematic_prior.length,
-        }
-    )
+    needs = needs_of_tree(task.needs)
+    search = Search(seed=options.seed, seconds=task.seconds, kinematic_prior=task.recorded.kinematic_prior)
     solution = fit_tree(
         needs,
         task.sets.train,
@@ -68,7 +60,7 @@ def fit(task: Task, options: Any, folder: Path, mesh: Mesh | None) -> tuple[Task
         parents=task.description["parents"],
         acceleration=task.description["acceleration"],
         velocity_scale=task.description["velocity_scale"],
-        settings=Search(seed=options.seed, seconds=task.seconds, **near),
+        settings=search,
         report=print,
     )
     size = f"{solution.parameter_count} parameters, of the linear ones rank {solution.rank}, "
