@@ -91,7 +91,9 @@ def identify_by(*, double_pendulum: Path | None = None, splits: int = len(HELD_O
     def fits(rest, held):
         by_torques = identify(model, known, rest[0])
         window, _ = choose_window("motions", model, known, *rest)
-        by_motions, by_both = (refit(by, model, known, by_torques, *rest, window)[0] for by in ("motions", "both"))
+        by_motions, by_both = (
+            refit(by, model, known, by_torques, rest[0], rest[1], window)[0] for by in ("motions", "both")
+        )
         measured = {"torques": by_torques, "motions": by_motions, "both": by_both}
         return {way: (model, parameters_of(solution.theta, known)) for way, solution in measured.items()}
 
