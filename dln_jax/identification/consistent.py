@@ -55,11 +55,11 @@ class ConsistentFit(NamedTuple):
     """Whether the Newton decrement fell below the tolerance; otherwise the iterations or the line search ran out."""
 
 
-def _armature(theta: np.ndarray, group: list[tuple[int, int, int]]) -> np.ndarray:
+def _armature(theta: np.ndarray, entries: list[tuple[int, int, int]]) -> np.ndarray:
     """Armature matrix of coupled motors, without the others."""
-    motors = sorted({motor for _, motor, _ in group})
+    motors = sorted({motor for _, motor, _ in entries})
     A = np.zeros((len(motors), len(motors)))
-    for column, i, j in group:
+    for column, i, j in entries:
         A[motors.index(i), motors.index(j)] = A[motors.index(j), motors.index(i)] = theta[column]
     return A
 
@@ -91,7 +91,7 @@ def fit_consistent(
     """Fits physically consistent parameters by least squares, with the known values as prior.
 
     Args:
-        triangle: triangular factor of the equations in units of noise, from `equations.weighted`.
+        triangle: triangular factor of the equations in units of noise, from `equations.whiten`.
         columns: columns of the P parameters; the ten of a body are adjacent.
         known: prior and initial values. An inconsistent body is replaced by `nearest_body`, a zero coefficient by one
             that explains a hundredth of the torque. A body with ten zeros is absent and stays zero.
@@ -118,19 +118,19 @@ def fit_consistent(
         directions = [np.asarray(body_of_pseudo_inertia(factor @ E @ factor.T)) for E in _BASIS]
         maps.append(identity[:, places] @ np.stack(directions, axis=1))
         bases.append(_BASIS)
-    for group in columns.motors:
-        places = [column for column, *_ in group]
-        start[places] = [start[column] if i == j else known[column] for column, i, j in group]
-        if not np.linalg.eigvalsh(_armature(start, group))[0] > 0:
-            start[places] = [start[column] if i == j else 0.0 for column, i, j in group]
-        factor = np.linalg.cholesky(_armature(start, group))
+    if entries := columns.motors:
+        places = [column for column, *_ in entries]
+        start[places] = [start[column] if i == j else known[column] for column, i, j in entries]
+        if not np.linalg.eigvalsh(_armature(start, entries))[0] > 0:
+            start[places] = [start[column] if i == j else 0.0 for column, i, j in entries]
+        factor = np.linalg.cholesky(_armature(start, entries))
         back = np.linalg.inv(factor)
-        units = [_armature(identity[column], group) for column in places]
+        units = [_armature(identity[column], entries) for column in places]
         relative = np.stack([back @ unit @ back.T for unit in units])
         lengths_of = np.linalg.norm(relative, axis=(1, 2))
         maps.append(identity[:, places] / lengths_of)
         bases.append(relative / lengths_of[:, None, None])
-    positive = np.setdiff1d(positive, [column for group in columns.motors for column, *_ in group])
+    positive = np.setdiff1d(positive, [column for column, *_ in columns.motors])
     to_theta = np.hstack([*maps, identity[:, positive] * start[positive], identity[:, signed] * typical[signed]])
     A, r = triangle[:, :-1] @ to_theta, triangle[:, :-1] @ start - triangle[:, -1]
     blocks, first = [], 0
@@ -149,7 +149,7 @@ class _Problem(NamedTuple):
     A: np.ndarray
     r: np.ndarray
     blocks: tuple[tuple[slice, np.ndarray], ...]
-    """Places in x, and basis [K, n, n], of every body and group of coupled motors."""
+    """Places in x, and basis [K, n, n], of every body and of the coupled motors."""
     z: slice
     """Places of z in the unknowns x, which hold it in place of exp(z) - 1."""
 

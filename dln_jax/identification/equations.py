@@ -52,20 +52,14 @@ class Columns(NamedTuple):
         return np.flatnonzero(np.array(self.kinds) == "inertia").reshape(-1, 10)
 
     @property
-    def motors(self) -> list[list[tuple[int, int, int]]]:
-        """Groups of motors that are coupled: (column, motor, motor) of every entry of their armature matrix."""
-        pairs: list[tuple[int, int, int]] = []
+    def motors(self) -> list[tuple[int, int, int]]:
+        """(column, motor, motor) of every entry of the armature matrix of the coupled motors."""
+        entries: list[tuple[int, int, int]] = []
         for column in np.flatnonzero(np.array(self.kinds) == "coupling").tolist():
             first, second = self.names[column].removeprefix(COUPLING).split("_")
-            pairs.append((column, int(first) - 1, int(second) - 1))
-        groups: list[list[tuple[int, int, int]]] = []
-        for entry in pairs:
-            near = [group for group in groups if {k for _, *both in group for k in both} & set(entry[1:])]
-            groups = [group for group in groups if group not in near] + [[entry, *(e for group in near for e in group)]]
-        for group in groups:
-            for motor in sorted({k for _, *both in group for k in both}):
-                group.append((self.names.index(f"{MOTORS}_{motor + 1}"), motor, motor))
-        return groups
+            entries.append((column, int(first) - 1, int(second) - 1))
+        coupled = sorted({motor for _, *both in entries for motor in both})
+        return entries + [(self.names.index(f"{MOTORS}_{motor + 1}"), motor, motor) for motor in coupled]
 
 
 def columns_of(parameters: Parameters) -> Columns:
@@ -109,14 +103,8 @@ class Equations(NamedTuple):
         return self.triangles.shape[2] - 1
 
 
-class Regressor(NamedTuple):
-    """Phi and tau of a dataset, recomputed in chunks on every pass to save memory."""
-
-    passes: Callable[[], Iterator[tuple[np.ndarray, np.ndarray]]]
-    """Starts a pass: yields Phi [n, d, P] and tau [n, d] of n samples at a time."""
-    samples: int
-    joints: int
-    unknowns: int
+Regressor = Callable[[], Iterator[tuple[np.ndarray, np.ndarray]]]
+"""Starts a pass over the equations: yields Phi [n, d, P] and tau [n, d] of n samples at a time, computed anew."""
 
 
 def regressor_of(
@@ -125,7 +113,6 @@ def regressor_of(
     data: Trajectories,
     *,
     free: np.ndarray | None = None,
-    linearise: Callable | None = None,
 ) -> Regressor:
     """Makes the regressor of a dataset.
 
@@ -134,7 +121,6 @@ def regressor_of(
         parameters: point where the model is differentiated and its linearity checked.
         data: samples with tau.
         free: [P]; columns where it is zero are set to zero, for parameters known to be zero.
-        linearise: `learning.linear.design(model)`, to reuse a compiled one.
 
     Raises:
         InputError: the data have no torques. A pass raises it if the model turns out not to be linear.
@@ -143,31 +129,31 @@ def regressor_of(
         raise InputError("the data have no tau; identification takes measured torques")
     theta = flat(parameters)
     with jax.enable_x64(True):
-        linearise = design(model) if linearise is None else linearise
         at = unravelled(theta, parameters)
 
     def passes() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         with jax.enable_x64(True):
-            for columns, predicted, tau in design_chunks(linearise, at, data, CHUNK):
+            for columns, predicted, tau in design_chunks(design(model), at, data, CHUNK):
                 require_linear(columns, theta, predicted)
                 yield columns if free is None else columns * free, tau
 
-    return Regressor(passes, len(data.tau), data.degrees_of_freedom, theta.size)
+    return passes
 
 
-def compressed(regressor: Regressor, weights: Float[np.ndarray, "N d"] | None = None) -> Equations:
+def compress(regressor: Regressor, weights: Float[np.ndarray, "N d"] | None = None) -> Equations:
     """Compresses the equations to triangular factors, with rows scaled by the square root of `weights`, if any."""
-    d, P = regressor.joints, regressor.unknowns
-    triangles, first = np.zeros((d, P + 1, P + 1)), 0
-    for columns, tau in regressor.passes():
+    triangles, first = np.zeros((0, 0, 0)), 0
+    for columns, tau in regressor():
         rows = np.concatenate([columns, tau[:, :, None]], axis=2)
         if weights is not None:
             rows = rows * np.sqrt(weights[first : first + len(tau), :, None])
+        if not first:
+            triangles = np.zeros((rows.shape[1], rows.shape[2], rows.shape[2]))
         first += len(tau)
-        for joint in range(d):
-            stacked = np.concatenate([triangles[joint], rows[:, joint]])
+        for joint, factor in enumerate(triangles):
+            stacked = np.concatenate([factor, rows[:, joint]])
             triangles[joint] = triangular_factor(stacked[:, :-1], stacked[:, -1])
-    return Equations(triangles, regressor.samples)
+    return Equations(triangles, first)
 
 
 def about(equations: Equations, theta: Float[np.ndarray, " P"]) -> Equations:
@@ -177,7 +163,7 @@ def about(equations: Equations, theta: Float[np.ndarray, " P"]) -> Equations:
     return equations._replace(triangles=shifted)
 
 
-def weighted(equations: Equations, noise: Float[np.ndarray, " d"]) -> Float[np.ndarray, "K P_and_1"]:
+def whiten(equations: Equations, noise: Float[np.ndarray, " d"]) -> Float[np.ndarray, "K P_and_1"]:
     """One triangular factor of all joints, with rows in units of the joint's noise."""
     rows = (equations.triangles / noise[:, None, None]).reshape(-1, equations.unknowns + 1)
     return triangular_factor(rows[:, :-1], rows[:, -1])
@@ -191,4 +177,4 @@ def squares(equations: Equations, theta: Float[np.ndarray, " P"]) -> Float[np.nd
 
 def residuals(regressor: Regressor, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, "N d"]:
     """tau - Phi theta of every sample."""
-    return np.concatenate([tau - columns @ theta for columns, tau in regressor.passes()])
+    return np.concatenate([tau - columns @ theta for columns, tau in regressor()])

@@ -11,16 +11,15 @@ from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.identification import equations
 from dln_jax.identification.base import BaseParameters, Determinacy, base_parameters, determinacy, null_directions
 from dln_jax.identification.consistent import REGULARISATION, ConsistentFit, fit_consistent
-from dln_jax.identification.equations import Columns, columns_of, compressed, flat, regressor_of
+from dln_jax.identification.equations import Columns, columns_of, compress, flat, regressor_of
 from dln_jax.identification.weighted import (
     ROUNDING,
-    ResidualStatistics,
     WeightedFit,
+    correlation_times,
     fit_robust,
     fit_weighted,
-    residual_statistics,
 )
-from dln_jax.learning.linear import design, unravelled
+from dln_jax.learning.linear import unravelled
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, JointKind
 
@@ -45,8 +44,8 @@ class Identification(NamedTuple):
     """Least-squares fit to the data; its bodies may be physically inconsistent."""
     seen: tuple[Determinacy, ...]
     """How these data determine every parameter."""
-    statistics: ResidualStatistics
-    """Statistics of the residuals of `fit`."""
+    correlation: Float[np.ndarray, " d"]
+    """Correlation time of every joint's residuals of `fit`, in samples."""
     consistent: ConsistentFit | None
     """Physically consistent parameters, if requested."""
 
@@ -65,10 +64,8 @@ def identify(
     at: Parameters | None = None,
     noise: Any = None,
     robust: bool = False,
-    rank_tolerance: float | None = None,
     consistent: bool = True,
     regularisation: float = REGULARISATION,
-    seed: int = 0,
 ) -> Identification:
     """Identifies the parameters of a model that is linear in them.
 
@@ -83,7 +80,6 @@ def identify(
             links' torques keep their signs: those of `learning.friction.fit_friction`.
         noise: standard deviation of the torque of each joint [d], N m or N; estimated by default.
         robust: use Huber's loss, which grows linearly beyond 1.345 times the noise; the noise is then estimated.
-        rank_tolerance: as for `fit_weighted`.
         consistent: also fit physically consistent parameters.
         regularisation: as for `fit_consistent`.
 
@@ -100,29 +96,27 @@ def identify(
     massless = ~theta[columns.bodies].any(axis=1)
     free = np.ones(len(theta))
     free[columns.bodies[massless]] = 0.0
-    linearise = design(model)
     at = known if at is None else at
-    regressor, weights = regressor_of(model, at, data, free=free, linearise=linearise), None
+    regressor, weights = regressor_of(model, at, data, free=free), None
     # The random states fill chunks of the same size as the data, so that both use one compiled program.
     samples = max(STATES * d, -(-len(data.t) // -(-len(data.t) // equations.CHUNK)))
-    states = random_states(joints, samples, seed)
-    general = compressed(regressor_of(model, at, states, free=free, linearise=linearise))
+    states = random_states(joints, samples, 0)
+    general = compress(regressor_of(model, at, states, free=free))
     A = general.triangles.reshape(-1, general.unknowns + 1)[:, :-1]
     structure, base = determinacy(null_directions(A)), base_parameters(A, columns)
     if robust:
-        rough, weights = fit_robust(regressor, theta, rank_tolerance=rank_tolerance)
+        rough, weights = fit_robust(regressor, theta)
         noise = rough.noise
-    compact = compressed(regressor, weights)
-    fit = fit_weighted(compact, theta, noise=noise, rank_tolerance=rank_tolerance)
-    statistics = residual_statistics(equations.residuals(regressor, fit.theta), data.trajectory, fit.noise)
-    errors = {"noise": fit.noise, "correlation": statistics.correlation}
-    fit = fit_weighted(compact, theta, rank_tolerance=rank_tolerance, **errors)
+    compact = compress(regressor, weights)
+    fit = fit_weighted(compact, theta, noise=noise)
+    correlation = correlation_times(equations.residuals(regressor, fit.theta), data.trajectory)
+    fit = fit_weighted(compact, theta, noise=fit.noise, correlation=correlation)
     bodies = None
     if consistent:
-        triangle = equations.weighted(compact, fit.noise)
+        triangle = equations.whiten(compact, fit.noise)
         bodies = fit_consistent(triangle, columns, theta, regularisation=regularisation)
     seen = seen_by(fit, base, structure)
-    return Identification(columns, theta, structure, base, fit, seen, statistics, bodies)
+    return Identification(columns, theta, structure, base, fit, seen, correlation, bodies)
 
 
 def seen_by(fit: WeightedFit, base: BaseParameters, structure: tuple[Determinacy, ...]) -> tuple[Determinacy, ...]:

@@ -3,11 +3,11 @@
     minimise over theta, the delay, and for every window w over its start z_w and a constant torque e_w
 
         sum over samples |(q(t; z_w, theta) - q_measured) / noise_q|² + sum over windows |e_w / noise_tau|²
-            + share * |R (theta, -1)|²   (equations of the torques in units of their noise, `equations.weighted`)
+            + |R (theta, -1)|²   (equations of the torques in units of their noise, `equations.whiten`)
 
 The simulated motion is driven by tau(t - delay) + e_w. Starts and constant torques are eliminated window by window
-(Kaufman's derivative, `learning.motions`). No acceleration is needed: forces that no log records, such as the vibration
-of a belt, enter torques of filtered motions but hardly move a joint.
+(Kaufman's derivative, `learning.shooting`). No acceleration is needed: forces that no log records, such as the
+vibration of a belt, enter torques of filtered motions but hardly move a joint.
 
 Windows in which something unusual happened, such as a touch, are off by far more than others. A window whose residual
 is longer than the median counts by the median over its length (Huber), with weights from the previous fit.
@@ -29,12 +29,10 @@ from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import window_indices
-from dln_jax.identification.consistent import REGULARISATION, fit_consistent
+from dln_jax.identification.consistent import fit_consistent
 from dln_jax.identification.equations import Columns
 from dln_jax.learning.linear import unravelled
-from dln_jax.learning.measured_motions import motion
-from dln_jax.learning.motions import without_start
+from dln_jax.learning.shooting import MeasuredWindows, cut_measured_windows, motion, without_start
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model
 from dln_jax.solvers.least_squares import triangular_factor
@@ -55,26 +53,12 @@ TYPICAL_DELAY = 1e-3
 """Unit of the delay among the unknowns, s."""
 
 
-class MotionWindows(NamedTuple):
-    """Measured motions of W windows of T samples; shorter ones repeat their last sample with weight 0."""
-
-    t: Float[np.ndarray, "W T"]
-    """Time since the first sample, s."""
-    q: Float[np.ndarray, "W T d"]
-    qd: Float[np.ndarray, "W T d"]
-    """Starts the search for z_w."""
-    tau: Float[np.ndarray, "W T d"]
-    slope: Float[np.ndarray, "W T d"]
-    """Rate of tau, N m/s or N/s, which shifts it in time."""
-    weight: Float[np.ndarray, "W T"]
-
-
 class MotionFit(NamedTuple):
     """Parameters that fit motions."""
 
     theta: Float[np.ndarray, " P"]
     delay: float
-    """Delay of the motions behind the logged torques, s; 0 if it was not fitted."""
+    """Delay of the motions behind the logged torques, s."""
     before: float
     """Root mean square distance of the motions from the measurements at the initial parameters, in units of noise_q."""
     after: float
@@ -83,29 +67,28 @@ class MotionFit(NamedTuple):
     converged: bool
 
 
-def cut_motions(data: Trajectories, length: int) -> MotionWindows:
-    """Consecutive windows of `length` samples within segments; errors as for `data.splits.window_indices`."""
-    indices, weight = window_indices(data, length)
-    slope = np.concatenate(
-        [
-            np.gradient(data.tau[own], data.t[own], axis=0)
-            for own in np.split(np.arange(len(data.t)), np.flatnonzero(np.diff(data.trajectory)) + 1)
-        ]
-    )
-    t = data.t[indices]
-    return MotionWindows(t - t[:, :1], data.q[indices], data.qd[indices], data.tau[indices], slope[indices], weight)
+def cut_motions(data: Trajectories, length: int) -> tuple[MeasuredWindows, Float[np.ndarray, "W T d"]]:
+    """Consecutive windows of `length` samples, and the rate of tau in them, N m/s or N/s, which shifts it in time.
+
+    Raises:
+        InputError: as for `cut_measured_windows`.
+    """
+    trajectories = np.split(np.arange(len(data.t)), np.flatnonzero(np.diff(data.trajectory)) + 1)
+    slope = np.concatenate([np.gradient(data.tau[own], data.t[own], axis=0) for own in trajectories])
+    return cut_measured_windows(data, length), cut_measured_windows(data._replace(tau=slope), length).tau
 
 
 @functools.lru_cache(maxsize=4)
 def linearise(model: Model) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
-    """(theta [P], delay, noise_q [d], noise_tau [d], windows) -> residuals [W, T d + d] and J [W, T d + d, P + 1].
+    """(theta [P], delay, noise_q [d], noise_tau [d], windows, slope) -> residuals [W, T d + d] and their derivatives.
 
-    The last column is that of the delay, in units of `TYPICAL_DELAY`. Residuals are those of the nearest starts.
+    The derivatives are [W, T d + d, P + 1]; the last column is that of the delay, in units of `TYPICAL_DELAY`.
+    Residuals are those of the nearest starts.
     """
     like = jax.eval_shape(model.init, jax.random.key(0))
 
     def one(unknowns: Array, noise_q: Array, noise_tau: Array, window: tuple[Array, ...]) -> Array:
-        t, q, qd, tau, slope, weight = window
+        t, q, qd, tau, weight, slope = window
         d = q.shape[1]
 
         def error(unknowns: Array, start: Array) -> Array:
@@ -128,13 +111,15 @@ def linearise(model: Model) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
 
     every = jax.jit(jax.vmap(both, in_axes=(None, None, None, 0)), compiler_options=quick_compilation())
 
-    def linearised(theta, delay, noise_q, noise_tau, windows: MotionWindows) -> tuple[np.ndarray, np.ndarray]:
+    def linearised(
+        theta, delay, noise_q, noise_tau, windows: MeasuredWindows, slope: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         unknowns = np.append(theta, delay / TYPICAL_DELAY)
         count, parts = len(windows.t), []
         with jax.enable_x64(True):
             for first in range(0, count, CHUNK):
                 rows = np.minimum(np.arange(first, first + CHUNK), count - 1)  # one shape, so one program
-                chunk = tuple(jnp.asarray(array[rows]) for array in windows)
+                chunk = tuple(jnp.asarray(array[rows]) for array in (*windows, slope))
                 parts.append([np.asarray(part) for part in every(unknowns, noise_q, noise_tau, chunk)])
         left, slopes = (np.concatenate(part)[:count] for part in zip(*parts, strict=True))
         return left, slopes
@@ -143,7 +128,11 @@ def linearise(model: Model) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
 
 
 def distances(
-    linearised: Callable, start: Float[np.ndarray, " P"], noise_tau: Float[np.ndarray, " d"], windows: MotionWindows
+    linearised: Callable,
+    start: Float[np.ndarray, " P"],
+    noise_tau: Float[np.ndarray, " d"],
+    windows: MeasuredWindows,
+    slope: Float[np.ndarray, "W T d"],
 ) -> Float[np.ndarray, " d"]:
     """Root mean square distance of every joint's simulated motion from the measured one, rad or m, in two rounds.
 
@@ -152,7 +141,7 @@ def distances(
     d = windows.q.shape[2]
     noise = spread = np.maximum(1e-3 * windows.q.reshape(-1, d).std(axis=0), np.finfo(float).tiny)
     for _ in range(2):
-        left = linearised(start, 0.0, noise, noise_tau, windows)[0][:, : windows.q[0].size]
+        left = linearised(start, 0.0, noise, noise_tau, windows, slope)[0][:, : windows.q[0].size]
         sizes = np.sum(left.reshape(-1, d) ** 2, axis=0) / windows.weight.sum()
         noise = np.maximum(noise * np.sqrt(sizes), 1e-3 * spread)
     return noise
@@ -171,7 +160,7 @@ def _damping(model: Model) -> Callable[..., Array]:
     return jax.jit(along, compiler_options=quick_compilation())
 
 
-def _require_resolved(model: Model, theta: Float[np.ndarray, " P"], windows: MotionWindows) -> None:
+def _require_resolved(model: Model, theta: Float[np.ndarray, " P"], windows: MeasuredWindows) -> None:
     """Raises `InputError` if derivatives of most windows grow without bound, as with steep dry friction near rest.
 
     A classical Runge-Kutta step multiplies a deviation that decays as exp(-z) by 1 - z + z²/2 - z³/6 + z⁴/24, which
@@ -198,14 +187,11 @@ def fit_motions(
     columns: Columns,
     prior: Float[np.ndarray, " P"],
     start: Float[np.ndarray, " P"],
-    windows: MotionWindows,
+    windows: MeasuredWindows,
+    slope: Float[np.ndarray, "W T d"],
     *,
     noise_tau: Float[np.ndarray, " d"],
-    noise_q: Float[np.ndarray, " d"] | None = None,
     torques: Float[np.ndarray, "K P_and_1"] | None = None,
-    share: float = 1.0,
-    delay: bool = True,
-    regularisation: float = REGULARISATION,
     reweightings: int = REWEIGHTINGS,
 ) -> MotionFit:
     """Fits physically consistent parameters to motions, and to torques too if their equations are given.
@@ -214,35 +200,28 @@ def fit_motions(
         model: a model that is linear in its parameters, such as `models.make_rigid_tree`.
         prior: values that undetermined directions keep.
         start: initial parameters with a positive definite mass matrix, such as consistent ones of a fit of torques.
-        windows: from `cut_motions`.
+        windows, slope: from `cut_motions`.
         noise_tau: standard deviation of a window's constant torque, N m or N.
-        noise_q: standard deviation of q, forces that were not recorded included, rad or m (default: the root mean
-            square distance of the motions simulated with the initial parameters).
         torques: triangular factor of the torques' equations in units of noise.
-        regularisation: as for `fit_consistent`.
         reweightings: number of times that windows are weighted by their distance and the fit is repeated.
 
     Raises:
-        InputError: a noise or share that is not positive, motions too stiff for their time step, or a start whose
+        InputError: a noise that is not positive, motions too stiff for their time step, or a start whose
             motions are not finite.
     """
-    require_positive(share=share, noise_tau=float(np.min(noise_tau)))
+    require_positive(noise_tau=float(np.min(noise_tau)))
     _require_resolved(model, start, windows)
     linearised = linearise(model)
-    if noise_q is None:
-        noise_q = distances(linearised, start, noise_tau, windows)
-    require_positive(noise_q=float(np.min(noise_q)))
+    noise_q = distances(linearised, start, noise_tau, windows, slope)
     P = len(start)
     wider = Columns((*columns.names, "delay"), (*columns.kinds, "signed"), (*columns.joints, 0))
-    fixed = np.zeros((0, P + 2)) if torques is None else np.sqrt(share) * np.insert(torques, P, 0.0, axis=1)
+    fixed = np.zeros((0, P + 2)) if torques is None else np.insert(torques, P, 0.0, axis=1)
     measured = np.sqrt(windows.weight.sum() * windows.q.shape[2])
     motions = windows.q.shape[1] * windows.q.shape[2]
     prior = np.append(prior, 0.0)
 
     def at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        left, slopes = linearised(x[:-1], TYPICAL_DELAY * x[-1], noise_q, noise_tau, windows)
-        if not delay:
-            slopes = slopes * np.append(np.ones(P), 0.0)
+        left, slopes = linearised(x[:-1], TYPICAL_DELAY * x[-1], noise_q, noise_tau, windows, slope)
         total = float(np.sum(left**2) + np.sum((fixed @ np.append(x, -1.0)) ** 2))
         return left, slopes, total
 
@@ -259,7 +238,7 @@ def fit_motions(
             J, r = slopes.reshape(-1, P + 1), left.ravel()
             rows = np.concatenate([np.column_stack([J, J @ x - r]), fixed])
             triangle = triangular_factor(rows[:, :-1], rows[:, -1])
-            target = fit_consistent(triangle, wider, prior, regularisation=regularisation)
+            target = fit_consistent(triangle, wider, prior)
             length, was = 1.0, total
             while True:
                 candidate = x + length * (target.theta - x)

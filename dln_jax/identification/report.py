@@ -63,7 +63,7 @@ def findings(result: Identification, data: Trajectories, names: tuple[str, ...])
         lines.append(f"determined by other motions, but not by these data: {shown}; vary speeds and postures more")
     if result.fit.condition > LARGE_CONDITION:
         lines.append(f"condition {result.fit.condition:.0f}: the motions are too similar; vary them more")
-    times = result.statistics.correlation
+    times = result.correlation
     slow = np.flatnonzero(times > LONG_CORRELATION)
     if len(slow):
         which = ", ".join(f"{names[k]} {times[k]:.0f}" for k in slow)

@@ -17,14 +17,16 @@ from jaxtyping import Float
 from dln_jax.data.arrays import spread
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split
+from dln_jax.data.splits import select as trajectories
 from dln_jax.learning import dynamics
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.learning.objectives import SCALED_TORQUE, arrays, residuals
+from dln_jax.learning.objectives import SCALED_TORQUE, arrays, residuals, squared_torque_errors
 from dln_jax.learning.select import Trial, segments, select
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.residual import ResidualParameters, frozen, make_residual, make_with_residual
 from dln_jax.types import InputError, Needs, ResidualTerm
+from dln_jax.zoo.descriptions import Description, describe
 
 
 class Candidate(NamedTuple):
@@ -42,6 +44,14 @@ CANDIDATES = (
     Candidate(("potential", "dissipation", "inertia"), 8),
     Candidate(("potential", "dissipation"), 16),
 )
+
+
+def inner_split(train: Trajectories) -> tuple[Trajectories, Trajectories]:
+    """Training data without every fourth trajectory or block, and those, to choose the size of a network by."""
+    present = np.unique(train.trajectory)
+    if len(present) < 2:
+        raise InputError("a part to choose by takes two trajectories or blocks to fit; record more motions")
+    return trajectories(train, np.setdiff1d(present, present[1::4])), trajectories(train, present[1::4])
 
 
 class ResidualFit(NamedTuple):
@@ -68,7 +78,6 @@ def fit_residual(
     candidates: tuple[Candidate, ...] = CANDIDATES,
     iterations: int = 40,
     seconds: float = math.inf,
-    seed: int = 0,
 ) -> ResidualFit:
     """Fits residual networks to the torques unexplained by an identified tree, and selects the smallest sufficient one.
 
@@ -88,37 +97,38 @@ def fit_residual(
         raise InputError("candidates start with a network; the first must be none, which the others have to improve on")
     began = time.perf_counter()
     with jax.enable_x64(True):
-        scale = SCALED_TORQUE.scale(train)
-        segment = segments(validation)
-        of_train, of_validation = (arrays(SCALED_TORQUE, data, jnp.float64) for data in (train, validation))
-        judge = jax.jit(lambda system_of, batch: residuals(SCALED_TORQUE, system_of(), batch) / scale, static_argnums=0)
-        unexplained = np.asarray(judge(lambda: rigid.energies(parameters), of_train)) * np.asarray(scale)
+        scale, segment = np.asarray(SCALED_TORQUE.scale(train)), segments(validation)
+        batch = arrays(SCALED_TORQUE, train, jnp.float64)
+        unexplained = jax.jit(lambda: residuals(SCALED_TORQUE, rigid.energies(parameters), batch))()
         magnitudes = {"torque_scale": unexplained, "rate_scale": train.qd, "acceleration_scale": train.qdd}
-        sizes = {name: _typical(name, values) for name, values in magnitudes.items()}
+        sizes = {
+            name: tuple(float(f"{size:.3g}") if size > 0 else 1.0 for size in spread(name, np.asarray(values)))
+            for name, values in magnitudes.items()
+        }
 
-        def errors(system_of: Any) -> Float[np.ndarray, " segments"]:
-            squares = np.sum(np.asarray(judge(system_of, of_validation)) ** 2, axis=1)
+        def errors(model: Model, parameters: Parameters) -> Float[np.ndarray, " segments"]:
+            squares = np.sum(squared_torque_errors(model, parameters, validation, scale), axis=1)
             return np.bincount(segment, squares) / np.bincount(segment)
 
         def attempt(candidate: Candidate) -> tuple[Any, Float[np.ndarray, " segments"]]:
             if not candidate.terms:
-                return None, errors(lambda: rigid.energies(parameters))
+                return None, errors(rigid, parameters)
             time_left = began + seconds - time.perf_counter()
             if time_left <= 0:
                 return None, np.full(segment.max() + 1, np.inf)
             settings = {**candidate._asdict(), **sizes}
             both = make_with_residual(rigid, make_residual(needs, **settings))
-            problem = dynamics.problem(
-                frozen(both, parameters), Split(train, validation, validation), SCALED_TORQUE, seeds=seed
-            )
+            problem = dynamics.problem(frozen(both, parameters), Split(train, validation, validation), SCALED_TORQUE)
             training = fit(problem, GaussNewton(steps=iterations), seconds=time_left)
             whole = ResidualParameters(parameters, training.parameters)
-            return (both, whole, settings), errors(lambda: both.energies(whole))
+            return (both, whole, settings), errors(both, whole)
 
         chosen, trials = select(candidates, attempt, patience=2)
     model, whole, settings = (rigid, parameters, {}) if chosen.outcome is None else chosen.outcome
     return ResidualFit(model, whole, chosen.candidate, settings, trials)
 
 
-def _typical(name: str, values: Float[np.ndarray, "N d"]) -> tuple[float, ...]:
-    return tuple(float(f"{size:.3g}") if size > 0 else 1.0 for size in spread(name, values))
+def with_network(description: Description, added: ResidualFit) -> Description:
+    """Description of a model with its residual network."""
+    keywords = {key: value for key, value in description.items() if key not in ("name", "precision")}
+    return describe(f"{description['name']}-residual", precision="f64", **keywords, **added.settings)

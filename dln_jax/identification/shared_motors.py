@@ -7,8 +7,6 @@ A motor with the rate m = qd_j + c qd_i, i < j, has friction F(m), which acts on
 Its share is what F(m) explains beyond friction of the joints' own rates, in that joint of the two where it is less.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from jaxtyping import Float
 
@@ -22,26 +20,8 @@ MOST = 4000
 """Number of samples that is enough."""
 
 
-class SharedMotor(NamedTuple):
-    """A motor that turns with two joints."""
-
-    joint: int
-    """j, counted from 0, as below."""
-    other: int
-    """i."""
-    ratio: float
-    """c."""
-    share: float
-
-    def rates(self, d: int) -> Float[np.ndarray, "d d"]:
-        """Returns S in the motor rates S qd, with one motor for each of d joints."""
-        rows = np.eye(d)
-        rows[self.joint, self.other] = self.ratio
-        return rows
-
-
-def shared_motor(left: Float[np.ndarray, "N d"], qd: Float[np.ndarray, "N d"]) -> SharedMotor | None:
-    """Returns the motor that explains most of the unexplained torques of two joints; `None` if none explains enough."""
+def shared_motor(left: Float[np.ndarray, "N d"], qd: Float[np.ndarray, "N d"]) -> tuple[int, int, float, float] | None:
+    """Returns j, i (from 0), c and the share of the motor that explains most; `None` if none explains enough."""
     d = left.shape[1]
     scale = left.std(axis=0)
     moving = np.flatnonzero((scale > 0) & (qd.std(axis=0) > 0))
@@ -59,8 +39,8 @@ def shared_motor(left: Float[np.ndarray, "N d"], qd: Float[np.ndarray, "N d"]) -
                 y = np.concatenate([left[:, k] / scale[k] for k in (j, i)])
                 rest = (y - A @ np.linalg.lstsq(A, y, rcond=None)[0]).reshape(2, -1)
                 share = float(np.min(1 - np.mean(rest**2, axis=1) / before))
-                if share >= SHARE and (best is None or share > best.share):
-                    best = SharedMotor(int(j), int(i), c, share)
+                if share >= SHARE and (best is None or share > best[3]):
+                    best = int(j), int(i), c, share
     return best if d > 1 else None
 
 

@@ -5,7 +5,7 @@
 Directions that the data do not determine keep their prior values: of all theta that fit equally well, the solution is
 the nearest to the prior, in units of the columns' lengths. The noise is noise_j² = |residual_j|² / (N - share of the
 parameters that joint j determines); fit and noise alternate until the noise converges. The covariance of theta assumes
-independent errors of this size; of residuals correlated over T samples, T count as one (`residual_statistics`).
+independent errors of this size; of residuals correlated over T samples, T count as one (`correlation_times`).
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from dln_jax.identification import equations
 from dln_jax.identification.base import unit_columns
-from dln_jax.identification.equations import Equations, Regressor, compressed, residuals
+from dln_jax.identification.equations import Equations, Regressor, compress, residuals
 from dln_jax.types import InputError
 
 ROUNDING = 1e-10
@@ -65,20 +65,20 @@ def fit_weighted(
     *,
     noise: Float[np.ndarray, " d"] | None = None,
     correlation: Float[np.ndarray, " d"] | None = None,
-    rank_tolerance: float | None = None,
 ) -> WeightedFit:
     """Fits the parameters by weighted least squares.
+
+    Singular values of unit-length columns count as zero below the inverse of the torque in units of its noise, relative
+    to the largest, or below 1e-10: along such a direction even an effect as large as all torque would not rise above
+    the noise.
 
     Args:
         known: prior values.
         noise: standard deviation of each joint's torque, N m or N; estimated by default, starting from equal noise.
         correlation: correlation time of each joint's residuals in samples; the covariance counts that many as one.
-        rank_tolerance: singular values of unit-length columns, relative to the largest, that count as zero. Default:
-            the inverse of the torque in units of its noise, at least 1e-10, since along such a direction even an effect
-            as large as all torque would not rise above the noise.
 
     Raises:
-        InputError: noise is not positive, a tolerance is outside [0, 1), tau is zero, or samples are too few.
+        InputError: noise is not positive, tau is zero, or samples are too few.
     """
     d, known = len(data.triangles), np.asarray(known, float)
     torque = np.sqrt(np.sum(data.triangles[:, :, -1] ** 2, axis=1) / data.samples)
@@ -86,33 +86,30 @@ def fit_weighted(
         raise InputError("tau is zero in every sample; identification takes measured torques")
     if noise is not None and not (np.shape(noise) == (d,) and np.all(np.asarray(noise) > 0)):
         raise InputError(f"noise is {noise}; expected a positive number for each of {d} joints")
-    if rank_tolerance is not None and not 0 <= rank_tolerance < 1:
-        raise InputError(f"rank_tolerance is {rank_tolerance}; expected a number in [0, 1)")
     if data.samples * d <= data.unknowns:
         raise InputError(f"{data.samples} samples of {d} joints for {data.unknowns} parameters; record more")
     shifted = equations.about(data, known)
     sigma = np.full(d, torque.mean()) if noise is None else np.asarray(noise, float)
     for _ in range(ROUNDS if noise is None else 0):
-        fit, shares = _solved(shifted, sigma, None, ROUNDING)
+        fit, shares = _solve(shifted, sigma, None, ROUNDING)
         freedoms = np.maximum(data.samples - shares, 1.0)
         deviation = np.sqrt(equations.squares(shifted, fit.theta) / freedoms)
         before, sigma = sigma, np.maximum(deviation, NOISE_FLOOR * torque.max())
         if (abs(sigma - before) <= 1e-6 * sigma).all():
             break
-    if rank_tolerance is None:
-        rank_tolerance = max(ROUNDING, 1 / np.sqrt(data.samples * np.sum((torque / sigma) ** 2)))
-    fit, _ = _solved(shifted, sigma, correlation, rank_tolerance)
+    rank_tolerance = max(ROUNDING, 1 / np.sqrt(data.samples * np.sum((torque / sigma) ** 2)))
+    fit, _ = _solve(shifted, sigma, correlation, rank_tolerance)
     return fit._replace(theta=known + fit.theta)
 
 
-def _solved(
+def _solve(
     data: Equations, sigma: np.ndarray, correlation: np.ndarray | None, rank_tolerance: float
 ) -> tuple[WeightedFit, np.ndarray]:
     """The fit for these noise levels, and every joint's share in determining the parameters; shares sum to the rank."""
-    triangle = equations.weighted(data, sigma)
+    triangle = equations.whiten(data, sigma)
     scaled, lengths = unit_columns(triangle[:, :-1])
     left, sizes, right = np.linalg.svd(scaled)
-    rank, effects = (int(np.sum(sizes > t * sizes[0])) for t in (rank_tolerance, min(ROUNDING, rank_tolerance)))
+    rank, effects = (int(np.sum(sizes > t * sizes[0])) for t in (rank_tolerance, ROUNDING))
     to_theta = (right[:effects] / sizes[:effects, None]).T / np.where(lengths > 0, lengths, 1.0)[:, None]
     to_theta[lengths == 0] = 0.0  # large torques in units of small noise would amplify rounding here
     # Rows of each joint in the basis of directions with an effect: their squares sum to one over all joints.
@@ -132,31 +129,12 @@ def _solved(
     return fit, np.sum(by_joint[:, :, :rank] ** 2, axis=(1, 2))
 
 
-class ResidualStatistics(NamedTuple):
-    """Statistics of the residuals of each joint [d]."""
-
-    rms: Float[np.ndarray, " d"]
-    """Root mean square, N m or N."""
-    share_beyond_three: Float[np.ndarray, " d"]
-    """Fraction of samples beyond three times the noise; 0.0027 for normal errors."""
-    excess_kurtosis: Float[np.ndarray, " d"]
-    """0 for normal errors; large for outliers."""
-    correlation: Float[np.ndarray, " d"]
-    """Correlation time in samples, 1 + 2 sum of autocorrelations; 1 for independent residuals."""
-
-
-def residual_statistics(
-    errors: Float[np.ndarray, "N d"], trajectory: np.ndarray, noise: Float[np.ndarray, " d"]
-) -> ResidualStatistics:
-    """Statistics of residuals relative to a noise level; they are correlated within trajectories only."""
-    square = np.mean(errors**2, axis=0)
-    kurtosis = np.mean(errors**4, axis=0) / np.where(square > 0, square, 1.0) ** 2 - 3
-    beyond = np.mean(abs(errors) > 3 * noise, axis=0)
-    return ResidualStatistics(np.sqrt(square), beyond, kurtosis, correlation_times(errors, trajectory))
-
-
 def correlation_times(errors: Float[np.ndarray, "N d"], trajectory: np.ndarray) -> Float[np.ndarray, " d"]:
-    """1 + 2 sum of autocorrelations, truncated at the first pair of lags whose sum is not positive (Geyer 1992)."""
+    """Correlation time of every joint's residuals in samples; 1 for independent ones.
+
+    1 + 2 sum of autocorrelations within trajectories, up to the first pair of lags whose sum is not positive (Geyer
+    1992).
+    """
     starts = np.flatnonzero(np.diff(trajectory)) + 1
     parts = np.split(errors, starts)
     longest = max(len(part) for part in parts)
@@ -174,9 +152,7 @@ def correlation_times(errors: Float[np.ndarray, "N d"], trajectory: np.ndarray) 
     return times
 
 
-def fit_robust(
-    regressor: Regressor, known: Float[np.ndarray, " P"], *, rank_tolerance: float | None = None
-) -> tuple[WeightedFit, Float[np.ndarray, "N d"]]:
+def fit_robust(regressor: Regressor, known: Float[np.ndarray, " P"]) -> tuple[WeightedFit, Float[np.ndarray, "N d"]]:
     """Huber's estimate: the loss grows linearly instead of quadratically beyond `THRESHOLD` times the noise.
 
     Iteratively reweighted least squares with weights min(1, threshold noise / |error|), returned with the fit; the
@@ -185,18 +161,17 @@ def fit_robust(
     Args:
         regressor: equations of the data; every iteration takes two passes.
         known: prior values.
-        rank_tolerance: as for `fit_weighted`.
 
     Raises:
         InputError: as for `fit_weighted`.
     """
-    fit = fit_weighted(compressed(regressor), known, rank_tolerance=rank_tolerance)
+    fit = fit_weighted(compress(regressor), known)
     errors = residuals(regressor, fit.theta)
     weights, tiny = np.ones_like(errors), np.finfo(float).tiny
     for _ in range(REWEIGHTINGS):
         noise = np.maximum(TO_DEVIATION * np.median(abs(errors), axis=0), tiny)
         weights = np.minimum(1.0, THRESHOLD * noise / np.maximum(abs(errors), tiny))
-        fit = fit_weighted(compressed(regressor, weights), known, noise=noise, rank_tolerance=rank_tolerance)
+        fit = fit_weighted(compress(regressor, weights), known, noise=noise)
         before, errors = errors, residuals(regressor, fit.theta)
         if (np.linalg.norm(errors - before, axis=0) <= SETTLED * np.linalg.norm(errors, axis=0)).all():
             break

@@ -2,6 +2,6 @@
 
     training = fit(dynamics.problem(model, split(data)), GaussNewton())
 
-`dynamics`, `rates`, `motions`, `accelerations`, `measured_motions`, `frames` and `functions` build problems. Models
+`dynamics`, `matching`, `shooting`, `frames` and `functions` build problems. Models
 that are linear in their parameters are solved directly. `uncertainty` estimates the uncertainty of a fitted model.
 """

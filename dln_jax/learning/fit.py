@@ -108,8 +108,13 @@ def direct_fit(
     return fit_of(description, needs, training, objective=objective, **how)
 
 
-def with_uncertainty(fit: Fit, parts: Parts, torque: str, say: Callable[[str], None]) -> Fit:
-    """Adds the uncertainty of the torques; says why if there is none."""
+def with_uncertainty(fit: Fit, parts: Parts, torque: str, say: Callable[[str], None], *, unit: Any = None) -> Fit:
+    """Adds the uncertainty of the torques; says why if there is none.
+
+    Args:
+        torque: name of the torque that the fit is of.
+        unit: scales of the joints' residuals in the fit, N m or N (default: the spread of the torques).
+    """
     if not fit.objective.of_torques:
         say(f"no uncertainty is stored: a {fit.name} is not fitted to torques alone")
         return fit
@@ -117,6 +122,7 @@ def with_uncertainty(fit: Fit, parts: Parts, torque: str, say: Callable[[str], N
         say(f"no uncertainty is stored: a {fit.name} has as many parameters as data")
         return fit
     settings = {
+        "unit": unit,
         "ridge": 0.0 if fit.properties.linear else None,
         "negligible": 1e-12 if "tree" in fit.description else 0.0,
     }

@@ -55,7 +55,7 @@ def empty_replay(capacity: int, d: int) -> Replay:
     return Replay(motion, motion, motion, motion, weight, weight)
 
 
-def appended(replay: Replay, q: Any, qd: Any, qdd: Any, tau: Any, *, blocks: int = 10) -> Replay:
+def append_recording(replay: Replay, q: Any, qd: Any, qdd: Any, tau: Any, *, blocks: int = 10) -> Replay:
     """Returns the replay with a further recording in its next empty places.
 
     Args:
@@ -126,15 +126,14 @@ def make_refit(model: Model, *, rounds: int = 6, iterations: int = 5) -> Refit:
     return refit
 
 
-def make_linear_refit(model: Model, *, negligible: float = 1e-12) -> Refit:
+def make_linear_refit(model: Model) -> Refit:
     """Returns a refit by one least-squares problem on all samples, for a model that is linear in its parameters.
 
     Initial parameters are ignored. Combinations of parameters that the replay leaves undetermined are zero (the
     shortest solution, see `solvers.least_squares`).
 
     Args:
-        model: linear in its parameters, such as `models.trigonometric` or `models.trees`.
-        negligible: as for `learning.linear.fit_linear`.
+        model: linear in its parameters, such as `models.planar_chain` or `models.rigid_tree`.
     """
     columns_of = design(model)
 
@@ -145,7 +144,7 @@ def make_linear_refit(model: Model, *, negligible: float = 1e-12) -> Refit:
         unit = np.asarray(_scale(replay))
         left = (np.asarray(columns)[used] / unit[:, None]).reshape(-1, np.shape(columns)[-1])
         right = (np.asarray(replay.tau)[used] / unit).ravel()
-        return unravelled(least_squares.solve(left, right, negligible=negligible).x, parameters)
+        return unravelled(least_squares.solve(left, right, negligible=1e-12).x, parameters)
 
     return refit
 
@@ -185,11 +184,11 @@ def learn_online(
         parameters: parameters that drive the first reference.
 
     Raises:
-        InputError: a recording that `appended` refuses.
+        InputError: a recording that `append_recording` refuses.
     """
     for reference in references:
         outcome, recording = drive(parameters, reference)
         if len(recording[0]):
-            replay = appended(replay, *recording)
+            replay = append_recording(replay, *recording)
             parameters = refit(parameters, replay)
         yield Visit(outcome, parameters, replay)

@@ -51,18 +51,21 @@ class Posterior(NamedTuple):
     degrees_of_freedom: Float[np.ndarray, " d"]
 
 
-def spectrum(
-    rows: Rows, unit: Float[np.ndarray, " d"], *, rank_tolerance: float | None = None, negligible: float = 0.0
-) -> Spectrum:
+def spectrum(rows: Rows, unit: Float[np.ndarray, " d"], *, negligible: float = 0.0) -> Spectrum:
     """Computes the spectrum of all rows; takes about N d P² operations, and memory for d P² numbers.
 
     Args:
         rows: columns and residuals of the training data.
         unit: scales of the joints' residuals in the fit.
-        rank_tolerance: as for `solvers.least_squares.solve`.
         negligible: as for `solvers.least_squares.solve`.
     """
-    triangles, samples = _triangles(rows, len(unit))
+    triangles: list[np.ndarray] = []
+    samples = 0
+    for columns, residual in rows:
+        samples += len(residual)
+        both = np.concatenate([columns, residual[:, :, None]], axis=2)
+        parts = [np.concatenate([*triangles[joint : joint + 1], both[:, joint]]) for joint in range(len(unit))]
+        triangles = [np.linalg.qr(part, mode="r") for part in parts]  # factors of the joints' [Phi_i r_i]
     squares = np.array([np.sum(triangle[:, -1] ** 2) for triangle in triangles])
     weighted = [triangle[:, :-1] / size for triangle, size in zip(triangles, unit, strict=True)]
     P = weighted[0].shape[1]
@@ -72,12 +75,12 @@ def spectrum(
     scaled = [np.where(seen, triangle, 0.0) / scale for triangle in weighted]
     _, sizes, right = np.linalg.svd(np.linalg.qr(np.concatenate(scaled), mode="r"), full_matrices=True)
     sizes = np.concatenate([sizes, np.zeros(P - len(sizes))])
-    tolerance = np.finfo(np.float64).eps * max(samples * len(unit), P) if rank_tolerance is None else rank_tolerance
+    tolerance = np.finfo(np.float64).eps * max(samples * len(unit), P)
     sizes = np.where(sizes > tolerance * sizes.max(initial=0.0), sizes, 0.0)
     return Spectrum(scale, sizes, right.T, [triangle @ right.T for triangle in scaled], squares, unit, samples)
 
 
-def left_out(
+def leave_out(
     spectrum: Spectrum,
     noise: Float[np.ndarray, " d"],
     columns: Float[np.ndarray, "n d P"],
@@ -108,18 +111,6 @@ def left_out(
     predicted = U @ (inverse @ np.einsum("nip,ni->p", U, weighted))
     variance = np.einsum("nip,pq,niq->ni", along, inverse @ inner @ inverse, along, optimize=True)
     return (weighted + predicted) * unit, np.maximum(variance, 0.0)
-
-
-def _triangles(rows: Rows, d: int) -> tuple[list[np.ndarray], int]:
-    """Returns the triangular factors of the joints' [Phi_i r_i], and the number of samples."""
-    folded: list[np.ndarray] = []
-    samples = 0
-    for columns, residual in rows:
-        samples += len(residual)
-        both = np.concatenate([columns, residual[:, :, None]], axis=2)
-        parts = [np.concatenate([*folded[joint : joint + 1], both[:, joint]]) for joint in range(d)]
-        folded = [np.linalg.qr(part, mode="r") for part in parts]
-    return folded, samples
 
 
 def leading_directions(rows: Callable[[], Rows], unit: Float[np.ndarray, " d"], count: int) -> Float[np.ndarray, "P K"]:

@@ -15,7 +15,7 @@ Held-out motions therefore scale both parts of the variance of every joint,
 
 The simplest form is kept unless another is better by more than half the logarithm of the effective samples per extra
 factor (Schwarz 1978): a few seconds that agree with the training change nothing. The held-out motions are those of the
-validation and, for least squares, also those of the training, each as if it had been left out (`posterior.left_out`).
+validation and, for least squares, also those of the training, each as if it had been left out (`posterior.leave_out`).
 Both parts are then multiplied by the `scatter` of the motions, because model errors differ between motions.
 
 A model that is linear in its parameters is right wherever the data determine its torque, even far from the data. No
@@ -34,7 +34,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select, select_samples
 from dln_jax.learning.linear import design, design_chunks
 from dln_jax.learning.objectives import torque_scale
-from dln_jax.learning.posterior import Posterior, Rows, Spectrum, leading_directions, left_out, posterior, spectrum
+from dln_jax.learning.posterior import Posterior, Rows, Spectrum, leading_directions, leave_out, posterior, spectrum
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.uncertainty import Domain, Uncertainty
 from dln_jax.solvers.normal_equations import count
@@ -78,7 +78,6 @@ def estimate(
     *,
     ridge: float | None = None,
     unit: Float[np.ndarray, " d"] | None = None,
-    rank_tolerance: float | None = None,
     negligible: float = 0.0,
     quantile: float = 0.999,
     margin: float = 1.25,
@@ -91,7 +90,6 @@ def estimate(
         validation: other trajectories, used for model selection at most.
         ridge: dimensionless, as in `learning.posterior`; 0 for least squares; by default chosen by validation.
         unit: scales of the joints' residuals in the fit, N m or N; by default `torque_scale`.
-        rank_tolerance: as for `solvers.least_squares.solve`.
         negligible: the value that `fit_linear` used.
         quantile: quantile of the data that sets the thresholds of `out_of_distribution`.
         margin: factor on the thresholds: held-out motions of the same kind go a little further.
@@ -109,36 +107,36 @@ def estimate(
         parameters = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), parameters)
         if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(parameters)):
             raise InputError("the parameters are not finite; train again")
-        held_out = thinned(validation, MOST_SAMPLES)
+        held_out = thin(validation, MOST_SAMPLES)
         if ridge == 0 or count(parameters) <= MOST_PARAMETERS:
             basis = None
         else:
-            basis = leading_directions(lambda: _rows(model, parameters, thinned(train, MOST_SAMPLES)), unit, DIRECTIONS)
-        known = spectrum(
-            _rows(model, parameters, train, basis), unit, rank_tolerance=rank_tolerance, negligible=negligible
-        )
-        fitted = _along(known, _rows(model, parameters, thinned(train, MOST_SAMPLES), basis))[0]
+            basis = leading_directions(lambda: _rows(model, parameters, thin(train, MOST_SAMPLES)), unit, DIRECTIONS)
+        known = spectrum(_rows(model, parameters, train, basis), unit, negligible=negligible)
+        fitted = _along(known, _rows(model, parameters, thin(train, MOST_SAMPLES), basis))[0]
         judged, residual = _along(known, _rows(model, parameters, held_out, basis))
-        folds = [] if ridge != 0 else _left_out(model, parameters, train, known)
-    tried = [
-        _calibrated(known, size, judged, residual, held_out.trajectory, folds)
-        for size in (RIDGES if ridge is None else (ridge,))
-    ]
-    chosen = min(tried, key=lambda calibrated: calibrated.unlikeliness)
-    along = chosen.posterior.along
+        folds = [] if ridge != 0 else _leave_out(model, parameters, train, known)
+    tried = []
+    for size in RIDGES if ridge is None else (ridge,):
+        of_ridge = posterior(known, size)
+        noise, inflation, unlikeliness = _calibrate(of_ridge, judged, residual, held_out.trajectory, folds)
+        tried.append((unlikeliness, size, of_ridge, noise, inflation))
+    _, chosen, fit, noise, inflation = min(tried, key=lambda calibrated: calibrated[0])
+    along = fit.along
     limits = np.concatenate([np.linalg.norm(part @ along, axis=2) for part in (fitted, judged)])
     factor, scale = (known.directions @ along) / known.scale[:, None], known.scale
-    undetermined = known.directions[:, known.sizes == 0] if chosen.ridge == 0 else np.zeros((len(scale), 0))
+    undetermined = known.directions[:, known.sizes == 0] if chosen == 0 else np.zeros((len(scale), 0))
     if basis is not None:
         factor, scale, undetermined = basis @ factor, np.ones(len(basis)), np.zeros((len(basis), 0))
     limit = np.maximum(margin * np.quantile(limits, quantile, axis=0), TINY)
     share = HARMLESS if ridge == 0 else 0.0
-    harmless = share * np.asarray(torque_scale(train), np.float64) / np.sqrt(np.maximum(chosen.inflation, TINY))
-    centre, reach = _reach(train, validation, quantile)
+    harmless = share * np.asarray(torque_scale(train), np.float64) / np.sqrt(np.maximum(inflation, TINY))
+    states, others = (np.concatenate([data.q, data.qd, data.qdd], axis=1) for data in (train, validation))
+    centre = (states.max(axis=0) + states.min(axis=0)) / 2
+    reach = np.quantile(abs(np.concatenate([states, others]) - centre), quantile, axis=0)
     reach = np.maximum(margin * reach, STILL)
     domain = Domain(np.maximum(limit, harmless), scale, undetermined, centre, reach, harmless)
-    uncertainty = Uncertainty(factor, chosen.noise, chosen.inflation, domain)
-    return Estimate(uncertainty, chosen.ridge, chosen.posterior.degrees_of_freedom, chosen.posterior.noise)
+    return Estimate(Uncertainty(factor, noise, inflation, domain), chosen, fit.degrees_of_freedom, fit.noise)
 
 
 def calibration(
@@ -177,7 +175,6 @@ def scatter(relative: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
         (1 + sqrt((1 + 1 / M) (var(s) - chance))) (t / z)²    where var(s) > chance
 
     The first factor is one standard deviation of a new motion's s above their mean. In the second, t and z are the
-    97.5 % quantiles of Student's distribution with M - 1 degrees of freedom and of the normal one: a variance that
     97.5 % quantiles of Student's distribution with M - 1 degrees of freedom and of the normal one, because M motions
     estimate the variance with few degrees of freedom. By chance alone the variance of s is 2 / n for normal
     residuals, and an estimate of it from M motions has the relative error e; chance is 2 / n (1 + 2 e) with
@@ -219,29 +216,20 @@ def effective_samples(residual: Float[np.ndarray, " N"], trajectory: np.ndarray)
     return len(residual) / total
 
 
-def thinned(data: Trajectories, most: int) -> Trajectories:
+def thin(data: Trajectories, most: int) -> Trajectories:
     """Returns at most `most` samples, evenly spaced."""
     rows = np.linspace(0, len(data.t) - 1, min(most, len(data.t))).round().astype(int)
     return select_samples(data, np.unique(rows))
 
 
-class _Calibrated(NamedTuple):
-    posterior: Posterior
-    ridge: float
-    noise: np.ndarray
-    inflation: np.ndarray
-    unlikeliness: float
-
-
-def _calibrated(
-    known: Spectrum,
-    ridge: float,
+def _calibrate(
+    fitted: Posterior,
     rows: np.ndarray,
     residual: np.ndarray,
     trajectory: np.ndarray,
     folds: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
-) -> _Calibrated:
-    fitted = posterior(known, ridge)
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Calibrated noise and inflation of every joint, and the mean negative log-likelihood."""
     variances = np.sum((rows @ fitted.along) ** 2, axis=2)
     parts = zip((residual, variances, trajectory), *folds, strict=True)
     residual, variances, trajectory = (np.concatenate(part) for part in parts)
@@ -252,10 +240,10 @@ def _calibrated(
     a, b, unlikeliness = np.array(joints).T
     expected = np.maximum(a * fitted.noise**2 + b * variances, TINY)
     factors = np.array([scatter(relative, trajectory) for relative in (residual / np.sqrt(expected)).T])
-    return _Calibrated(fitted, ridge, np.sqrt(factors * a) * fitted.noise, factors * b, float(unlikeliness.mean()))
+    return np.sqrt(factors * a) * fitted.noise, factors * b, float(unlikeliness.mean())
 
 
-def _left_out(
+def _leave_out(
     model: Model, parameters: Parameters, train: Trajectories, known: Spectrum
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Residuals, variances and trajectories of training data as if held out, a fold of trajectories at a time."""
@@ -266,7 +254,7 @@ def _left_out(
     for indices in np.array_split(present, min(FOLDS, len(present))):
         data = select(train, indices)
         columns, residual = _along(known, _rows(model, parameters, data))
-        folds.append((*left_out(known, noise, columns, residual), data.trajectory))
+        folds.append((*leave_out(known, noise, columns, residual), data.trajectory))
     return folds
 
 
@@ -280,10 +268,3 @@ def _along(known: Spectrum, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     parts = [(columns / known.scale @ known.directions, residual) for columns, residual in rows]
     columns, residuals = zip(*parts, strict=True)
     return np.concatenate(columns), np.concatenate(residuals)
-
-
-def _reach(train: Trajectories, validation: Trajectories, quantile: float) -> tuple[np.ndarray, np.ndarray]:
-    """Middle of the range of (q, qd, qdd) in training, and the quantile of all data's distance from it, both [3 d]."""
-    states, others = (np.concatenate([data.q, data.qd, data.qdd], axis=1) for data in (train, validation))
-    centre = (states.max(axis=0) + states.min(axis=0)) / 2
-    return centre, np.quantile(abs(np.concatenate([states, others]) - centre), quantile, axis=0)

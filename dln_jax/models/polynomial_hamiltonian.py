@@ -5,7 +5,7 @@
 The phi_k are all products, up to a total degree, of powers of p_j, of powers of the displacements of prismatic joints,
 and of cos(n q_j) and sin(n q_j), of degree n, for revolute joints. The constant is left out, because no motion shows
 it. Hamilton's equations are linear in c, so linear least squares identifies it from rates of states
-(`learning.rates.match_linear`). The number of terms grows with the degree to the power of the number of coordinates.
+(`learning.matching.match_linear`). The number of terms grows with the degree to the power of the number of coordinates.
 """
 
 import itertools

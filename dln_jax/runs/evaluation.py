@@ -101,14 +101,13 @@ def evaluate(
         say: takes lines on what the test cannot provide.
     """
     test, training = parts.sets.test, fit.training
-    model, double_model = fit.model, double(fit)
     # The test samples are followed by the validation samples, so that one program predicts both.
     keys = [key for key in ("q", "qd", "qdd", "tau", "p", "pd") if getattr(test, key) is not None]
     both = test._replace(
         **{key: np.concatenate([getattr(part, key) for part in (test, parts.sets.validation)]) for key in keys}
     )
     samples = samples_of(both, fit.dtype)
-    predict = compiled(prediction_program(model.energies, mesh=mesh))
+    predict = compiled(prediction_program(fit.model.energies, mesh=mesh))
     answers = as_arrays(predict(fit.parameters, samples))
     predicted = {name: array[: len(test.t)] for name, array in answers.items()}
     motions, of_rollouts = rollouts(fit, test, log, say)
@@ -118,16 +117,9 @@ def evaluate(
         of_seeds = [predict(fit.of_seed(index), samples)["tau"] for index in range(seeds)]
         errors_of_seeds = [mean_square(np.asarray(tau, float)[: len(test.t)] - test.tau) for tau in of_seeds]
         spread = {f"torque_mse_{name}": float(function(errors_of_seeds)) for name, function in SUMMARIES.items()}
-    of_bands, figures = {}, figures_of(fit, parts, log, motions, predicted)
-    if fit.uncertainty is not None:
-        std, out_of_distribution = bands(double_model, fit.parameters, fit.uncertainty, test)
-        shares = coverage(predicted["tau"] - test.tau, std, levels=(LEVEL,)).shares[0]
-        of_bands = {
-            "coverage_95_share": float(shares.mean()),
-            "coverage_95_worst_joint_share": float(shares[np.argmax(abs(shares - LEVEL))]),
-            "out_of_distribution_share": float(out_of_distribution.mean()),
-        }
-        figures["uncertainty.png"] = png(torque_bands, test, predicted["tau"], std, out_of_distribution, model=fit.name)
+    figures = figures_of(fit, parts, log, motions, predicted)
+    of_bands, of_figures = bands_of(fit, test, predicted["tau"])
+    figures |= of_figures
     latency = latency_of(fit, test)
     validation = np.ravel(training.validation)
     metrics = {
@@ -283,6 +275,28 @@ def verdict_on_search(search: TreeFit, errors: HeldOut) -> tuple[Verdict | None,
     else:
         return None, numbers
     return Verdict("doubtful", reason, remedy), numbers
+
+
+def bands_of(
+    fit: Fit, test: Trajectories, predicted: np.ndarray
+) -> tuple[dict[str, float], dict[str, Callable[[Path], None]]]:
+    """Coverage of the 95 % bands on test torques, share of test states out of distribution, and their figure.
+
+    Empty for a fit without uncertainty.
+
+    Args:
+        predicted: the model's torques on the test data [N, d].
+    """
+    if fit.uncertainty is None:
+        return {}, {}
+    std, out_of_distribution = bands(double(fit), fit.parameters, fit.uncertainty, test)
+    shares = coverage(predicted - test.tau, std, levels=(LEVEL,)).shares[0]
+    metrics = {
+        "coverage_95_share": float(shares.mean()),
+        "coverage_95_worst_joint_share": float(shares[np.argmax(abs(shares - LEVEL))]),
+        "out_of_distribution_share": float(out_of_distribution.mean()),
+    }
+    return metrics, {"uncertainty.png": png(torque_bands, test, predicted, std, out_of_distribution, model=fit.name)}
 
 
 def bands(model: Model, parameters: Any, uncertainty: Uncertainty, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:

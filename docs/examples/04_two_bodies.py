@@ -15,7 +15,7 @@ import numpy as np
 from dln_jax import GaussNewton, Needs, fit
 from dln_jax.data.splits import hold_out
 from dln_jax.figures import style
-from dln_jax.learning.rates import problem
+from dln_jax.learning.matching import rates_problem
 from dln_jax.mechanics import equations
 from dln_jax.mechanics.integrators import gauss_legendre4, rollout
 from dln_jax.models.hamiltonian import make_pairwise_hamiltonian
@@ -42,7 +42,7 @@ print(f"{len(task.train.data.t)} samples for training")
 
 model = make_pairwise_hamiltonian(Needs(("prismatic",) * 4), width=8, depth=1, activation=tanh, dtype=jnp.float64)
 train, validation = hold_out(task.train.data, 0.1, seed=0)
-training = fit(problem(model, train, validation), GaussNewton(steps=ITERATIONS))
+training = fit(rates_problem(model, train, validation), GaussNewton(steps=ITERATIONS))
 flow = equations.flow(model.energies(training.parameters))
 
 # %%

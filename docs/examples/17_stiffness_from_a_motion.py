@@ -15,8 +15,8 @@ import numpy as np
 from matplotlib.collections import PolyCollection
 
 from dln_jax.figures import style
-from dln_jax.learning.soft_body_identification import ObservedMotions, identify
 from dln_jax.rollout import rollout
+from dln_jax.softbody.identification import ObservedMotions, identify
 from dln_jax.softbody.mesh.mesh import vertices_where
 from dln_jax.softbody.mesh.shapes import beam
 from dln_jax.softbody.scene import make_scene, with_parameters

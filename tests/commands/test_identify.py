@@ -10,8 +10,8 @@ from planar_arm import FRICTION, URDF, motions
 
 from dln_jax import load, load_c, read_robot
 from dln_jax.commands import identify
+from dln_jax.commands.identification.log import split
 from dln_jax.export.c.run import export_run
-from dln_jax.training.identification.task import noises, split
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 LOG = "--robot arm.urdf --data log.npz"
@@ -65,14 +65,6 @@ def test_the_model_is_loaded_and_exported_and_the_file_has_what_was_identified(i
     assert re.search(r"Armature, .*: shoulder 0\.\d+, elbow 0\.\d+", (identified / "arm_identified.urdf").read_text())
 
 
-def test_least_squares_that_is_no_body_is_kept_without_a_file(workplace, capsys):
-    command(identify, LOG, "--out free --no-consistent --robust", QUICK)
-    said = capsys.readouterr().out
-    assert "no arm_identified.urdf: the least-squares links behind" in said
-    assert "10 blocks" not in said and "blocks of time of the one trajectory" in said
-    assert not list((workplace / "free").glob("*.urdf")) and load("free").dynamics is not None
-
-
 def test_ruined_log_is_refused_without_a_robots_file(workplace, capsys):
     log = dict(np.load("log.npz"))
     for name, factor, words in (("turned", -1, ""), ("milli", 1000, "times the tree's; check the unit of tau")):
@@ -82,6 +74,7 @@ def test_ruined_log_is_refused_without_a_robots_file(workplace, capsys):
         told = capsys.readouterr()
         assert status == 1 and told.err.startswith("error: the fit is refused: ") and words in told.err
         assert "no arm_identified.urdf: the fit is refused" in told.out
+        assert "10 blocks" not in told.out and "blocks of time of the one trajectory" in told.out
         folder = workplace / name
         assert json_of(folder / "metrics.json")["verdict"] == 2 and not list(folder.glob("*.urdf"))
 
@@ -97,7 +90,6 @@ def test_mistakes_are_one_line(workplace, capsys):
         "--data one.npz": "the data have 1 joints, the robot 2",
         "--data silent.npz": "have no tau",
         "--robot broken.urdf": "not XML",
-        "--regularisation 0": "regularisation is 0.0",
         "--velocity-scale 0": "velocity_scale is 0.0",
         "--window 0.3": "--window is for --by motions or both",
         "--by motions --window -1": "window is -1.0; expected a positive number",
@@ -108,12 +100,11 @@ def test_mistakes_are_one_line(workplace, capsys):
 
 def test_trajectories_are_held_out_whole_and_one_in_blocks_of_time():
     six, one = (motions(0, samples=samples, trajectories=count) for samples, count in ((10, 6), (60, 1)))
-    for asked, held in ((None, [2]), (["0", "5"], [0, 5])):
-        assert np.unique(split(six, asked).test.trajectory).tolist() == held and not split(six, asked).blocks
-    blocks = split(one, None)
-    assert blocks.blocks and len(blocks.train.t) == 48
-    assert [blocks.test.label[k] for k in np.unique(blocks.test.trajectory)] == ["0[2]", "0[7]"]
+    for asked, held in ((None, [2]), ("0,5", [0, 5])):
+        _, test, in_blocks = split(six, asked)
+        assert np.unique(test.trajectory).tolist() == held and not in_blocks
+    train, test, in_blocks = split(one, None)
+    assert in_blocks and len(train.t) == 48
+    assert [test.label[k] for k in np.unique(test.trajectory)] == ["0[2]", "0[7]"]
     with one_line("one only"):
-        split(one, ["0"])
-    with one_line("expected 2 positive numbers"):
-        noises("1", 2)
+        split(one, "0")

@@ -12,7 +12,7 @@ from dln_jax.data.schema import from_arrays
 from dln_jax.identification.equations import columns_of, flat
 from dln_jax.identification.identify import parameters_of
 from dln_jax.identification.motions import cut_motions, fit_motions, linearise
-from dln_jax.learning.measured_motions import motion
+from dln_jax.learning.shooting import motion
 from dln_jax.models.trees import make_rigid_tree
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
@@ -54,19 +54,19 @@ def test_the_slope_of_windows_is_that_of_finite_differences(place):
         t, tau, states = moved(model.energies(parameters_of(theta, known)), 2)
     arrays = {"t": t, "q": states[:, :1], "qd": states[:, 1:], "tau": tau, "trajectory": np.zeros(len(t), int)}
     windows = cut_motions(from_arrays(arrays), 21)
-    assert len(windows.t) == 10
+    assert len(windows[1]) == 10
     at, scales = linearise(model), (np.array([1e-3]), np.array([0.1]))
-    left, slopes = at(theta, 0.0, *scales, windows)
+    left, slopes = at(theta, 0.0, *scales, *windows)
     assert np.abs(left).max() < 1e-6
     for column in (0, 4, 10, 11):  # mass (no effect on a joint through the origin), I_xx, armature, friction
         change = 1e-5 * np.eye(len(theta))[column]
-        above, below = (at(theta + sign * change, 0.0, *scales, windows)[0] for sign in (1, -1))
+        above, below = (at(theta + sign * change, 0.0, *scales, *windows)[0] for sign in (1, -1))
         difference = (above - below) / 2e-5
         np.testing.assert_allclose(slopes[:, :, column], difference, atol=1e-4 * max(1.0, np.abs(difference).max()))
     stiff = np.concatenate([theta[:-1], [100.0]])
     # It decays at 100 / 0.06 1/s, and a Runge-Kutta step of 10 ms is stable up to 278.5 1/s.
     with one_line(r"friction acts up to 5\.98 times faster than the log's step of 0\.01 s resolves"):
-        fit_motions(model, columns_of(known), stiff, stiff, windows, noise_tau=scales[1])
+        fit_motions(model, columns_of(known), stiff, stiff, *windows, noise_tau=scales[1])
 
 
 def test_motions_identify_the_pendulum_and_predict_longer(place, capsys):

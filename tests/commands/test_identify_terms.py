@@ -46,7 +46,7 @@ def place(folder):
 
 
 def test_all_terms_are_identified_and_written(place, capsys):
-    terms = "--friction viscous,coulomb,load --temperature --motors 1,0;1,1"
+    terms = "--friction viscous,coulomb,load,temperature --motors 1,0;1,1"
     command(identify, "--robot arm.xml --data log.npz --out run --no-figures", terms)
     said = capsys.readouterr().out
     assert "friction by load: kept" in said and "friction by temperature: kept" in said and "verdict: good" in said
@@ -77,7 +77,7 @@ def test_terms_that_are_none_are_refused(folder, capsys):
         ("--motors 1,1;1,1", "that can be inverted"),
         ("--coupled 1-2", "--coupled has '1-2'; expected pairs of joints such as 2:3"),
         ("--coupled 1:3", "--coupled is 1:3; expected each pair of different joints"),
-        ("--temperature --friction coulomb", "--temperature changes viscous friction"),
-        ("--temperature", "friction is to depend on temperature, which the data do not have"),
+        ("--friction coulomb,temperature", "temperature changes viscous friction"),
+        ("--friction viscous,temperature", "friction is to depend on temperature, which the data do not have"),
     ]
     assert_refused(capsys, identify, rows, "--robot arm.xml --data cold.npz --accept-log", out=folder / "none")

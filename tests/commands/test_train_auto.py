@@ -84,7 +84,8 @@ def test_a_kinematic_prior_and_parents_reach_the_search(workplace, capsys, monke
     options = "--kinematic-prior prior.json --parents 0,1 --out near --needs"
     assert "seen" in refused(capsys, train_delan, TREE, options, PLAIN.replace("]}", '], "velocity_scale": 0.02}'))
     assert seen["parents"] == (-1, 0) and seen["scale"] == 0.02
-    assert len(seen["kinematic_prior"].rotations) == 2 and seen["prior_angle"] == pytest.approx(np.radians(10))
+    assert len(seen["kinematic_prior"].frames.rotations) == 2
+    assert seen["kinematic_prior"].angle == pytest.approx(np.radians(10))
 
 
 def test_mistakes_are_one_line(workplace, capsys):

@@ -9,7 +9,7 @@ from planar_arm import ARM, FRICTION, LENGTH, motions
 from dln_jax.data.splits import select
 from dln_jax.identification.base import base_parameters, determinacy, in_words, null_directions
 from dln_jax.identification.consistent import fit_consistent, is_consistent, nearest_body
-from dln_jax.identification.equations import columns_of, compressed, flat, regressor_of, squares, weighted
+from dln_jax.identification.equations import columns_of, compress, flat, regressor_of, squares, whiten
 from dln_jax.identification.identify import identify, parameters_of, random_states
 from dln_jax.identification.report import base_rows, findings, lost, parameter_rows, summary, text
 from dln_jax.identification.residual import Candidate, fit_residual
@@ -37,7 +37,7 @@ def clean():
 
 
 def test_base_parameters_are_those_of_the_textbook():
-    equations = compressed(regressor_of(MODEL, KNOWN, random_states(ARM.joints, 60, 0)))
+    equations = compress(regressor_of(MODEL, KNOWN, random_states(ARM.joints, 60, 0)))
     A = equations.triangles.reshape(-1, 29)[:, :-1]
     base = base_parameters(A, COLUMNS)
     assert base.words == (
@@ -117,13 +117,13 @@ def test_links_without_mass_stay_so():
 @pytest.fixture(scope="module")
 def noisy():
     """Noisy equations of an arm that is known roughly, what is known, and the fit."""
-    equations = compressed(regressor_of(MODEL, ROUGH, motions(0, noise=0.2, trajectories=3)))
+    equations = compress(regressor_of(MODEL, ROUGH, motions(0, noise=0.2, trajectories=3)))
     return equations, flat(ROUGH), fit_weighted(equations, flat(ROUGH))
 
 
 def test_consistent_bodies_exist_and_cost_little(noisy):
     equations, known, fit = noisy
-    result = fit_consistent(weighted(equations, fit.noise), COLUMNS, known)
+    result = fit_consistent(whiten(equations, fit.noise), COLUMNS, known)
     assert result.converged and all(is_consistent(result.theta, COLUMNS)) and not all(is_consistent(fit.theta, COLUMNS))
     assert (result.theta[POSITIVE] > 0).all()
     # Least squares is the least there is; a body that exists explains as much but for some standard errors.
@@ -137,7 +137,7 @@ def test_consistent_bodies_exist_and_cost_little(noisy):
 def test_regularisation_keeps_what_is_known(noisy):
     """A hundred million measurements' worth of trust leave the bodies where they were, and none lets them go."""
     equations, known, fit = noisy
-    triangle = weighted(equations, fit.noise)
+    triangle = whiten(equations, fit.noise)
     tight, *loose = (fit_consistent(triangle, COLUMNS, known, regularisation=strength) for strength in (1e8, 1.0, 1e-3))
     np.testing.assert_allclose(tight.theta[INERTIAL], known[INERTIAL], rtol=1e-2, atol=1e-3)
     some, most = (result.divergence.sum() for result in loose)
@@ -157,7 +157,7 @@ def sum_of(theta, triangle, known):
 def test_no_direction_decreases_the_sum(noisy, spoiled):
     """Also with a torque turned round, where bodies lie at the edge of those that exist."""
     equations, known, fit = noisy
-    triangle = weighted(equations, fit.noise)
+    triangle = whiten(equations, fit.noise)
     if spoiled:
         triangle = np.linalg.qr(np.vstack([triangle[:, :-1].T, -triangle[:, -1] + triangle[:, 0]]).T, mode="r")
     known = np.where(POSITIVE & (known == 0), 0.1, known)
@@ -217,7 +217,7 @@ def test_mistakes_are_named(noisy):
         (lambda: identify(MODEL, ROUGH, data, joints=("revolute",) * 3), "the data have 2 joints, the robot 3"),
         (lambda: identify(MODEL, ROUGH, data._replace(estimated=("tau",))), "have no tau"),
         (lambda: identify(MODEL, ROUGH, data, robust=True, noise=[1.0, 1.0]), "leave one of them out"),
-        (lambda: fit_consistent(weighted(equations, fit.noise), COLUMNS, known, regularisation=0.0), "regularisation"),
+        (lambda: fit_consistent(whiten(equations, fit.noise), COLUMNS, known, regularisation=0.0), "regularisation"),
         (lambda: nearest_body(np.zeros(10)), "no mass"),
         (lambda: make_residual(ARM.needs, terms=()), "terms are"),
         (lambda: make_residual(ARM.needs, torque_scale=0.0), "torque_scale"),

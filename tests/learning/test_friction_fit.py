@@ -10,9 +10,7 @@ from motions import sums_of_sines
 from planar_arm import ARM as PLANAR
 
 from dln_jax.data.schema import from_arrays
-from dln_jax.learning.friction import fit_friction
-from dln_jax.learning.friction_selection import choose_terms
-from dln_jax.learning.friction_terms import terms_of
+from dln_jax.learning.friction import choose_terms, fit_friction, terms_of
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction.laws import FrictionShape
 from dln_jax.models.trees import make_rigid_tree
@@ -30,11 +28,10 @@ SHAPES = {
     "cooling": {"friction": LAWS, "cooling": (0.02, 0.01), "reference_temperature": 25.0},
 }
 """Friction of the plants, by what they have beside viscous and dry friction."""
-OPTIONS = {"cooling": False, "motors": None, "coupled": ()}
-TERMS = terms_of(LAWS, None, (), **OPTIONS)
+TERMS = terms_of(LAWS)
 CANDIDATES = {
     "coupled": TERMS._replace(coupled=((0, 1),)),
-    "load": terms_of(("load",), None, (), **OPTIONS),
+    "load": terms_of(("load",)),
     "cooling": TERMS._replace(learned=("cooling",)),
 }
 

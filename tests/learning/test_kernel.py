@@ -7,8 +7,7 @@ from calls import one_line
 from jax.flatten_util import ravel_pytree
 
 from dln_jax.data.splits import select
-from dln_jax.learning.kernel import fit_kernel
-from dln_jax.learning.marginal_likelihood import TorqueEquations, Unknowns, likelihood, start_of
+from dln_jax.learning.kernel import TorqueEquations, Unknowns, fit_kernel, likelihood, start_of
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.kernel import States
 from dln_jax.scenes.datasets.generators import uniform

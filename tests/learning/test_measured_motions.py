@@ -9,8 +9,7 @@ from jax.flatten_util import ravel_pytree
 
 from dln_jax.data import schema
 from dln_jax.data.encoders.smoothing import smooth_locally
-from dln_jax.learning import measured_motions
-from dln_jax.learning.measured_motions import Gauge, Noise, cut_measured_windows, motion
+from dln_jax.learning.shooting import Gauge, Noise, cut_measured_windows, measured_problem, motion
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.trigonometric import make_planar_chain
 from dln_jax.types import Needs
@@ -76,7 +75,7 @@ def test_the_optimum_is_the_truth_as_well_as_noise_allows(driven):
     np.testing.assert_allclose(noise, NOISE, rtol=SURE / np.sqrt(2 * 0.7 * len(data.t)))
     windows = cut_measured_windows(data, WINDOW)
     known = {"noise": Noise(NOISE, tau=0.01)} if driven else {"noise": Noise(NOISE), "gauge": GAUGE}
-    slope, step, errors = statistics(measured_motions.problem(CHAIN, TRUE, windows, windows, **known), TRUE)
+    slope, step, errors = statistics(measured_problem(CHAIN, TRUE, windows, windows, **known), TRUE)
     true = np.asarray(ravel_pytree(TRUE)[0])
     assert np.all(np.abs(step) < SURE * errors)
     assert np.all(errors[:5] < (0.03 if driven else 0.01) * true[:5])
@@ -95,5 +94,5 @@ def test_mistakes_are_named():
     ]:
         known = {"noise": Noise(NOISE), "gauge": GAUGE} | changed
         with one_line(message):
-            task = measured_motions.problem(CHAIN, TRUE, windows, windows, **known)
+            task = measured_problem(CHAIN, TRUE, windows, windows, **known)
             task.residual(TRUE, *(array[0] for array in task.arrays))

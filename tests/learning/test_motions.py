@@ -10,7 +10,7 @@ from dln_jax.data import schema
 from dln_jax.data.splits import segments
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.learning.motions import Weights, cut_windows, problem
+from dln_jax.learning.shooting import Weights, cut_windows, phase_problem
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.models.model import Model
 
@@ -59,14 +59,14 @@ def test_a_damped_oscillator_is_recovered_from_its_positions():
     arrays = {"t": t, "q": q[:, None], "qd": p[:, None], "qdd": p[:, None], "p": p[:, None] + 0.2}
     windows = cut_windows(schema.from_arrays({**arrays, "trajectory": np.zeros(60)}), 15)
     start = jnp.array([3.0, 0.0])
-    task = problem(damped(), start, windows, windows, weights=Weights((0.01, np.inf)), substeps=8)
+    task = phase_problem(damped(), start, windows, windows, weights=Weights((0.01, np.inf)), substeps=8)
     np.testing.assert_allclose(fit(task, GaussNewton(15)).parameters["model"], [k, b], rtol=1e-4)
 
 
 def test_mistakes_are_named():
     data, start = motion_of(np.arange(8)), jnp.ones(2)
     windows = cut_windows(data, 4)
-    pose = functools.partial(problem, damped(), start, windows)
+    pose = functools.partial(phase_problem, damped(), start, windows)
     for call, message in [
         (lambda: cut_windows(data, 1), "length is 1"),
         (lambda: cut_windows(data._replace(p=None), 4), "no p"),

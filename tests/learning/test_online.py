@@ -8,7 +8,7 @@ from calls import one_line
 
 from dln_jax.learning.online import (
     Replay,
-    appended,
+    append_recording,
     empty_replay,
     learn_online,
     make_linear_refit,
@@ -33,7 +33,7 @@ def recordings(count, samples=20):
 def grown(capacity, parts):
     replay = empty_replay(capacity, 2)
     for part in parts:
-        replay = appended(replay, *part)
+        replay = append_recording(replay, *part)
     return replay
 
 
@@ -61,7 +61,7 @@ def test_a_linear_model_is_exact_after_one_recording():
     refit, replay, parameters = make_linear_refit(model), empty_replay(60, 2), model.init(jax.random.key(0))
     assert torque_error(model, parameters, test) > 1
     for part in (first, second):
-        replay = appended(replay, *part)
+        replay = append_recording(replay, *part)
         parameters = refit(parameters, replay)
         assert torque_error(model, parameters, test) < 1e-11
     np.testing.assert_allclose(parameters.viscous, 0, atol=1e-11)
@@ -72,15 +72,15 @@ def test_one_block_of_each_recording_is_held_out():
     np.testing.assert_array_equal(np.flatnonzero(replay.held_out), [10, 11, 30, 31])
     np.testing.assert_array_equal(replay.fitted[:40] + replay.held_out[:40], 1)
     assert not replay.fitted[40:].any() and not replay.held_out[40:].any()
-    assert not appended(empty_replay(5, 2), *(x[:3] for x in recordings(1)[0])).held_out.any()
+    assert not append_recording(empty_replay(5, 2), *(x[:3] for x in recordings(1)[0])).held_out.any()
 
 
 def test_recordings_that_do_not_fit_are_refused():
     (part,), replay = recordings(1), empty_replay(30, 2)
     for call, message in [
-        (lambda: appended(appended(replay, *part), *part), "10 empty places for 20 samples"),
-        (lambda: appended(replay, *part[:3], np.full_like(part[3], np.nan)), "not finite"),
-        (lambda: appended(replay, *part[:3], part[3][:, :1]), r"\(20, 1\).*expected the same \[n, 2\]"),
+        (lambda: append_recording(append_recording(replay, *part), *part), "10 empty places for 20 samples"),
+        (lambda: append_recording(replay, *part[:3], np.full_like(part[3], np.nan)), "not finite"),
+        (lambda: append_recording(replay, *part[:3], part[3][:, :1]), r"\(20, 1\).*expected the same \[n, 2\]"),
         (lambda: empty_replay(0, 2), "capacity"),
     ]:
         with one_line(message):

@@ -8,7 +8,7 @@ from calls import one_line
 from motions import quick_motion
 
 from dln_jax.data.splits import hold_out
-from dln_jax.learning.rates import match_linear, problem
+from dln_jax.learning.matching import match_linear, rates_problem
 from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.metrics import phase_space as phase_metrics
@@ -84,9 +84,9 @@ def test_mistakes_are_named(swing):
     data, needs = swing.train.data, Needs(joints=("revolute",))
     model = make_phase_network(needs, **SMALL)
     for call, message in [
-        (lambda: problem(model, data, data, most_samples=0), "most_samples is 0"),
-        (lambda: problem(model, data, data, seed=-1), "seed is -1"),
-        (lambda: problem(model, data._replace(p=None), data), "p and pd, which the data do not have"),
+        (lambda: rates_problem(model, data, data, most_samples=0), "most_samples is 0"),
+        (lambda: rates_problem(model, data, data, seed=-1), "seed is -1"),
+        (lambda: rates_problem(model, data._replace(p=None), data), "p and pd, which the data do not have"),
         (lambda: hold_out(data, 1.5, 0), "validation_share is 1.5"),
         (lambda: hold_out(data._replace(trajectory=0 * data.trajectory), 0.1, 0), "there are 1 trajectories"),
         (lambda: make_polynomial_hamiltonian(needs, degree=1), "degree is 1"),

@@ -9,7 +9,6 @@ from typing import get_args, get_type_hints
 
 from dln_jax.commands import COMMANDS, identify, train_delan, train_diffnet, train_hnn, train_hnn_task, train_value
 from dln_jax.control.optimal.plants import PLANTS
-from dln_jax.identification.consistent import REGULARISATION
 from dln_jax.learning.settings import WAYS
 from dln_jax.mechanics.friction.laws import LAWS, USUAL
 from dln_jax.nn.activations import ALL
@@ -20,7 +19,6 @@ from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.training.functions import options as functions
 from dln_jax.training.functions.task import NAMED
 from dln_jax.training.hamiltonian import options as phase_spaces
-from dln_jax.training.identification import options as identification
 from dln_jax.zoo.catalogue import CATALOGUE
 
 HELP = """
@@ -57,12 +55,12 @@ def test_names_and_defaults_in_options_are_those_of_the_library():
     assert set(WAYS) - {"auto"} <= set(CATALOGUE)
     assert set(phase_spaces.GENERATED) == set(PROTOCOLS)
     assert set(functions.NAMES) == set(NAMED)
-    assert set(identification.IDENTIFIED) == set(LAWS)
+    assert set(identify.LAWS) == set(LAWS)
     assert shown(train_value.TrainingOptions, "plant") == {*PLANTS, "FILE"}
     assert shown(functions.Learned, "activation") == set(ALL)
     assert set(get_args(get_type_hints(phase_spaces.Motion)["model"])) - {"auto"} <= set(CATALOGUE)
     defaults = {field.name: field.default for field in dataclasses.fields(identify.Arguments)}
-    assert defaults["regularisation"] == REGULARISATION and defaults["friction"] == ",".join(USUAL)
+    assert defaults["friction"] == ",".join(USUAL)
 
 
 def test_an_option_exists_for_the_choices_that_read_it():

@@ -16,11 +16,11 @@ from dln_jax.control.optimal.fitted import Iteration, fit_value
 from dln_jax.control.optimal.problem import ControlProblem
 from dln_jax.control.optimal.residual import fit_hjb
 from dln_jax.control.optimal.value_networks import value_network
-from dln_jax.learning.soft_body_identification import ObservedMotions, identify
 from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
 from dln_jax.locomotion.learning import Goal, compile_learner, learn, make_policy
 from dln_jax.locomotion.task import make_task
 from dln_jax.scale.mesh import batch_mesh
+from dln_jax.softbody.identification import ObservedMotions, identify
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import Creature
 from dln_jax.softbody.scene import State

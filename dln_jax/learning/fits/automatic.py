@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -21,27 +20,26 @@ from dln_jax.data.log import Log
 from dln_jax.data.parts import Parts
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import every
-from dln_jax.data.splits import select as trajectories
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.files import is_file, read_json, write_json
 from dln_jax.identification.identify import identify, parameters_of
-from dln_jax.identification.residual import fit_residual
+from dln_jax.identification.residual import fit_residual, inner_split
+from dln_jax.identification.rigid_tree import build_rigid_tree, describe_rigid_tree
 from dln_jax.learning.context import Context
 from dln_jax.learning.fit import Fit, direct_fit
 from dln_jax.learning.fits.tree import needs_of_tree, with_joint_laws
-from dln_jax.learning.friction import fit_friction
 from dln_jax.learning.linear import MOST_PARAMETERS, parameters_of_degree
 from dln_jax.learning.objectives import SCALED_TORQUE, require_scales, squared_torque_errors, torque_scale
 from dln_jax.learning.select import Trial, lowest, mean_of_segments, select, simplest
 from dln_jax.learning.selection import say_selection
 from dln_jax.learning.settings import Automatic, Kernel, LearnedTree, Network, Trigonometric
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction.laws import USUAL, FrictionShape, shape_of
+from dln_jax.mechanics.friction.laws import USUAL
 from dln_jax.mechanics.trees.description import tree_to_json
 from dln_jax.metrics.errors import definiteness
 from dln_jax.models.trees import RigidTreeParameters, tree_of
 from dln_jax.types import InputError, Needs
-from dln_jax.zoo.descriptions import build, describe
+from dln_jax.zoo.descriptions import describe
 from dln_jax.zoo.run import load
 
 SELECTION_SECONDS, CANDIDATE_SECONDS = 300.0, 120.0
@@ -256,24 +254,14 @@ def is_definite(result: Fit, parts: Parts) -> bool:
 
 def identified(log: Log, parts: Parts) -> Fit:
     """Identifies the bodies and the friction of the robot's tree."""
-    robot, train, needs = log.robot, parts.sets.train, log.needs
-    assert robot is not None
-    began = time.perf_counter()
-    laws, tree = needs.joint_friction, robot.tree
-    shape = {"velocity_scale": needs.velocity_scale}
-    if shape_of(laws):
-        held = ("velocity_scale",) * (needs.velocity_scale != Needs(needs.joints).velocity_scale)
-        some = every(train, -(-len(train.t) // MOST_SAMPLES))
-        friction = fit_friction(tree, some, laws, shape=FrictionShape(**shape), held=held)
-        shape |= {name: values.tolist() for name, values in friction.shape.items()}
-    description = describe("rigid-tree", precision="f64", needs=needs, tree=tree_to_json(tree), **shape)
-    model = build(description)
-    known = model.init(jax.random.key(0))
-    stated = {"viscous": robot.damping, "coulomb": robot.coulomb}
-    known = known._replace(
-        **{name: jnp.asarray(values) for name, values in stated.items() if getattr(known, name) is not None}
-    )
-    solution = identify(model, known, train, joints=tree.joints)
+    if log.robot is None:
+        raise InputError("the log names no robot, whose tree could be identified; give its file as robot=")
+    began, train, needs = time.perf_counter(), parts.sets.train, with_joint_laws(log.needs)
+    stated = needs.velocity_scale != Needs(needs.joints).velocity_scale
+    scale = needs.velocity_scale if stated else None
+    description, _, _ = describe_rigid_tree(log.robot, needs, train, velocity_scale=scale)
+    model, known = build_rigid_tree(description, log.robot)
+    solution = identify(model, known, train, joints=needs.joints)
     parameters = parameters_of(solution.theta, known)
     return direct(description, needs, parts, parameters, time.perf_counter() - began)
 
@@ -286,16 +274,13 @@ def with_network(base: Fit, log: Log, parts: Parts, context: Context) -> Fit | s
     """
     began, train = time.perf_counter(), parts.sets.train
     base = as_rigid(base, log, parts) if base.properties.searched else base
-    present = np.unique(train.trajectory)
-    if len(chosen_by := present[1::4]) == 0:
-        return "a residual network takes two trajectories or blocks to fit at least; record more motions"
-    fitted = trajectories(train, np.setdiff1d(present, chosen_by))
+    fitted, chosen_by = inner_split(train)
     added = fit_residual(
         base.model,
         base.parameters,
         log.needs,
         every(fitted, -(-len(fitted.t) // MOST_SAMPLES)),
-        trajectories(train, chosen_by),
+        chosen_by,
         seconds=min(context.seconds, CANDIDATE_SECONDS),
     )
     if not added.settings:

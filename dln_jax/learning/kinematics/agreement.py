@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from dln_jax.learning.kinematics.frames import Frames, mirrored
+from dln_jax.learning.kinematics.frames import Frames, mirror_image
 from dln_jax.learning.kinematics.projection import LENGTH, Structure
 
 SAME_ANGLE, SAME_LENGTH = np.radians(5.0), 0.03
@@ -62,26 +61,18 @@ class Twin(NamedTuple):
         return f"{kind} (axes within {angle:.2g}° and {length:.2g} mm, error {self.error:.3g} times)"
 
 
-class Lines(NamedTuple):
-    """Joint axes in space at q = 0."""
-
-    directions: Float[np.ndarray, "n 3"]
-    """Directions of all joint axes, then of gravity."""
-    points: Float[np.ndarray, "d 3"]
-
-
 def difference(first: Frames, second: Frames, structure: Structure) -> Difference:
     """Compares two arms of the same structure."""
     gravity = structure.acceleration > 0
     one = lines_of(first, structure.parents, gravity=gravity)
     turning = np.array([kind == "revolute" for kind in structure.joints])
-    others = second, mirrored(second, structure.parents, structure.joints)
+    others = second, mirror_image(second, structure.parents, structure.joints)
     offsets = [_aligned(one, lines_of(other, structure.parents, gravity=gravity), turning) for other in others]
     return min(offsets, key=lambda off: off.size)
 
 
-def lines_of(frames: Frames, parents: Sequence[int], *, gravity: bool) -> Lines:
-    """Axes of the joints in the frame of the ground."""
+def lines_of(frames: Frames, parents: Sequence[int], *, gravity: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of the joint axes [d, 3], followed by that of gravity, and points on the axes [d, 3], at q = 0."""
     rotations: list[np.ndarray] = []
     points: list[np.ndarray] = []
     for link, parent in enumerate(parents):
@@ -89,24 +80,27 @@ def lines_of(frames: Frames, parents: Sequence[int], *, gravity: bool) -> Lines:
         rotations.append(R @ np.asarray(frames.rotations[link]))
         points.append(p + R @ np.asarray(frames.positions[link]))
     down = [np.array([0.0, 0.0, -1.0])] * gravity
-    return Lines(np.stack([*(R[:, 2] for R in rotations), *down]), np.stack(points))
+    return np.stack([*(R[:, 2] for R in rotations), *down]), np.stack(points)
 
 
-def _aligned(one: Lines, other: Lines, turning: np.ndarray) -> Difference:
-    axes, pairs = one.directions[: len(one.points)], (one, other)
-    centres = [pair.points - pair.points[turning].mean(axis=0) if turning.any() else pair.points for pair in pairs]
+def _aligned(
+    one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray], turning: np.ndarray
+) -> Difference:
+    (ours, points), (theirs, _) = one, other
+    axes = ours[: len(points)]
+    centres = [p - p[turning].mean(axis=0) if turning.any() else p for _, p in (one, other)]
 
     def errors(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         R = Rotation.from_rotvec(x[:3]).as_matrix()
         apart = centres[1] @ R.T + x[3:] - centres[0]
         across = apart - np.sum(apart * axes, axis=1, keepdims=True) * axes
-        return other.directions @ R.T - one.directions, across[turning]
+        return theirs @ R.T - ours, across[turning]
 
     def residual(x: np.ndarray) -> np.ndarray:
         directions, across = errors(x)
         return np.concatenate([LENGTH * directions.ravel(), across.ravel()])
 
-    first = Rotation.align_vectors(one.directions, other.directions)[0]
+    first = Rotation.align_vectors(ours, theirs)[0]
     starts = [Rotation.from_rotvec(2 * np.pi * k / TURNS * axes[-1]) * first for k in range(TURNS)]
     solutions = [least_squares(residual, np.append(start.as_rotvec(), np.zeros(3))) for start in starts]
     directions, across = errors(min(solutions, key=lambda solution: solution.cost).x)

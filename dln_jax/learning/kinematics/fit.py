@@ -25,7 +25,7 @@ from dln_jax.learning.kinematics.projection import (
     design,
     inertias_of,
 )
-from dln_jax.learning.kinematics.search import ALIKE, Search, Searched, agreeing, search
+from dln_jax.learning.kinematics.search import ALIKE, Search, count_agreeing, search
 from dln_jax.learning.linear import design_chunks
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.models.trees import SerialTreeParameters, make_serial_tree
@@ -121,71 +121,62 @@ def fit_tree(
         scale = np.asarray(torque_scale(train))
         program, columns = compiled(structure, ridge=ridge), _columns(structure)
         some, every = (_some(train, count, settings.seed) for count in (settings.samples, most_samples))
-        searched, twin, until, wanted = Searched([], 0), None, began + settings.seconds, settings
+        searched, twin, until, wanted = ([], 0), None, began + settings.seconds, settings
 
-        def finished(descent: Descent) -> _Finished:
-            state, unit = _refined(program, structure, descent, every, scale, settings)
-            solution = _solved(columns, state, unit, train, rank_tolerance)
-            errors = [_joint_errors(columns, state.frames, solution.x, part) for part in (train, validation or train)]
-            return _Finished(state, solution, *errors)
+        def finished(descent: Descent) -> tuple[Descent, least_squares.LeastSquaresSolution, np.ndarray, np.ndarray]:
+            """The refined descent, its linear solution, and its mean squared errors by joint on both sets."""
+            state, unit = _refine(program, structure, descent, every, scale, settings)
+            solution = _solve(columns, state, unit, train, rank_tolerance)
+            trained, judged = (
+                _joint_errors(columns, state.frames, solution.x, part) for part in (train, validation or train)
+            )
+            return state, solution, trained, judged
 
         while True:
             searched = search(structure, program, some, scale, wanted, until=until, before=searched)
-            descents = searched.descents
-            report(
-                f"{len(descents)} descents, {agreeing(descents)} to the lowest loss, {float(descents[0].at.loss):.3g}"
-            )
+            descents, starts = searched
+            lowest = float(descents[0].at.loss)
+            report(f"{len(descents)} descents, {count_agreeing(descents)} to the lowest loss, {lowest:.3g}")
             finalists = _finalists(descents, validation)
             candidates = [finished(descent) for descent in finalists]
-            errors = [float(np.sum(candidate.judged / scale**2)) for candidate in candidates]
+            errors = [float(np.sum(judged / scale**2)) for *_, judged in candidates]
             chosen = int(np.argmin(errors))
-            best, start = candidates[chosen], finalists[chosen]
+            (state, solution, trained, judged), start = candidates[chosen], finalists[chosen]
             if not settings.confirm:
                 break
             if others := [descent for descent in descents if descent is not start and _alike(descent, start)]:
                 nearest = min(others, key=lambda other: difference(start.frames, other.frames, structure).size)
-                other = finished(nearest)
-                relative = float(np.sum(other.judged / scale**2)) / errors[chosen]
-                twin = Twin(relative, difference(best.state.frames, other.state.frames, structure))
+                other, *_, of_other = finished(nearest)
+                relative = float(np.sum(of_other / scale**2)) / errors[chosen]
+                twin = Twin(relative, difference(state.frames, other.frames, structure))
                 report(f"two descents to this tree's loss found {twin.words}")
-            if (twin is not None and twin.same) or searched.starts >= settings.starts or time.perf_counter() > until:
+            if (twin is not None and twin.same) or starts >= settings.starts or time.perf_counter() > until:
                 break
             # One more wave of starts, however many agree already.
-            wanted = settings._replace(agreement=agreeing(descents) + 1)
+            wanted = settings._replace(agreement=count_agreeing(descents) + 1)
         losses = np.array([float(descent.at.loss) for descent in descents])
-        frames, solution = best.state.frames, best.solution
-        parameters = _parameters(structure, frames, solution.x)
+        parameters = _parameters(structure, state.frames, solution.x)
     return TreeFit(
         parameters=parameters,
-        frames=jax.tree.map(np.asarray, frames),
-        torque_mse=float(best.trained.sum()),
-        joint_mse=best.trained,
-        validation_error=float("nan") if validation is None else float(best.judged.sum()),
-        parameter_count=len(best.state.at.slope) + structure.linear_count,
+        frames=jax.tree.map(np.asarray, state.frames),
+        torque_mse=float(trained.sum()),
+        joint_mse=trained,
+        validation_error=float("nan") if validation is None else float(judged.sum()),
+        parameter_count=len(state.at.slope) + structure.linear_count,
         rank=solution.rank,
         condition=solution.condition,
         losses=losses,
-        agreeing=agreeing(descents),
+        agreeing=count_agreeing(descents),
         agreement=settings.agreement,
         twin=twin,
         seconds=time.perf_counter() - began,
     )
 
 
-class _Finished(NamedTuple):
-    """A refined descent with its linear parameters and mean squared errors by joint."""
-
-    state: Descent
-    solution: least_squares.LeastSquaresSolution
-    trained: Float[np.ndarray, " d"]
-    judged: Float[np.ndarray, " d"]
-    """Error on the validation samples, or on the training samples if there are none."""
-
-
 def _some(data: Trajectories, most: int, seed: int) -> Samples:
-    """Returns all samples, or a random subset of at most `most`."""
+    """q, qd, qdd and tau [N, d] of all samples, or of a random subset of at most `most`."""
     some = drawn(data, most, seed)
-    return Samples(some.q, some.qd, some.qdd, some.tau)
+    return some.q, some.qd, some.qdd, some.tau
 
 
 def _alike(one: Descent, other: Descent) -> bool:
@@ -205,7 +196,7 @@ def _finalists(descents: list[Descent], validation: Trajectories | None) -> list
     return kept
 
 
-def _refined(
+def _refine(
     program: Program,
     structure: Structure,
     state: Descent,
@@ -222,7 +213,7 @@ def _refined(
     return state, unit
 
 
-def _solved(
+def _solve(
     columns: Callable, state: Descent, unit: Float[np.ndarray, " d"], data: Trajectories, rank_tolerance: float
 ) -> least_squares.LeastSquaresSolution:
     """Solves for the linear parameters of known frames on all data, by singular values."""

@@ -37,6 +37,16 @@ class Frames(NamedTuple):
     """[d, 3], m."""
 
 
+class KinematicPrior(NamedTuple):
+    """Frames and their deviations."""
+
+    frames: Frames
+    angle: float = float(np.radians(ROUGHNESS["angle_degrees"]))
+    """Deviation of the axes, rad."""
+    length: float = ROUGHNESS["length"]
+    """Deviation of the positions, m."""
+
+
 def random_frames(d: int, random: np.random.Generator) -> Frames:
     """Returns frames with random orientations and positions."""
     rotations, _ = np.linalg.qr(random.normal(size=(d, 3, 3)))
@@ -44,14 +54,13 @@ def random_frames(d: int, random: np.random.Generator) -> Frames:
     return Frames(rotations, REACH * random.normal(size=(d, 3)))
 
 
-def rough_frames(kinematic_prior: Frames, random: np.random.Generator, *, angle: float, length: float) -> Frames:
-    """Perturbs prior frames: rotates them by `angle`, rad, about random axes, and moves them by `length`, m."""
-    directions = random.normal(size=(2, *np.shape(kinematic_prior.positions)))
+def rough_frames(prior: KinematicPrior, random: np.random.Generator) -> Frames:
+    """Perturbs prior frames by their deviations: rotates them about random axes, and moves them."""
+    rotations, positions = map(np.asarray, prior.frames)
+    directions = random.normal(size=(2, *positions.shape))
     directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    turns = np.asarray(jax.vmap(rotation)(jnp.asarray(angle * directions[0])))
-    return Frames(
-        np.asarray(kinematic_prior.rotations) @ turns, np.asarray(kinematic_prior.positions) + length * directions[1]
-    )
+    turns = np.asarray(jax.vmap(rotation)(jnp.asarray(prior.angle * directions[0])))
+    return Frames(rotations @ turns, positions + prior.length * directions[1])
 
 
 def free_directions(parents: Sequence[int], joints: Sequence[JointKind]) -> np.ndarray:
@@ -67,13 +76,13 @@ def free_directions(parents: Sequence[int], joints: Sequence[JointKind]) -> np.n
     return np.array(places)
 
 
-def displaced(frames: Frames, step: Float[Array, "d 6"]) -> Frames:
+def displace(frames: Frames, step: Float[Array, "d 6"]) -> Frames:
     """Rotates frames by the vectors step[:, :3], rad, and moves them by step[:, 3:], m, both in their own axes."""
     positions = frames.positions + jnp.einsum("iab,ib->ia", frames.rotations, step[:, 3:])
     return Frames(frames.rotations @ jax.vmap(rotation)(step[:, :3]), positions)
 
 
-def turned_round(frames: Frames, parents: Sequence[int], joint: int) -> Frames:
+def turn_round(frames: Frames, parents: Sequence[int], joint: int) -> Frames:
     """Returns the same arm at q = 0 with one joint's direction of motion reversed.
 
     Where gravity dominates, torques hardly distinguish the two arms, and descents end at either.
@@ -87,8 +96,8 @@ def turned_round(frames: Frames, parents: Sequence[int], joint: int) -> Frames:
     return Frames(rotations, positions)
 
 
-def mirrored(frames: Frames, parents: Sequence[int], joints: Sequence[JointKind]) -> Frames:
-    """Returns the mirror image: it moves in the same way under the same torques if the inertias are mirrored too.
+def mirror_image(frames: Frames, parents: Sequence[int], joints: Sequence[JointKind]) -> Frames:
+    """Returns the mirror image: it moves in the same way under the same torques if the inertias are mirror_image too.
 
     Reflecting x in every frame reverses the rotation of revolute joints; reversing y and z of their links restores it.
     """
@@ -100,16 +109,6 @@ def mirrored(frames: Frames, parents: Sequence[int], joints: Sequence[JointKind]
     ]
     positions = [turn @ mirror @ p for turn, p in zip(before, frames.positions, strict=True)]
     return Frames(np.array(rotations), np.array(positions))
-
-
-class KinematicPrior(NamedTuple):
-    """Frames and their deviations."""
-
-    frames: Frames
-    angle: float = float(np.radians(ROUGHNESS["angle_degrees"]))
-    """Deviation of the axes, rad."""
-    length: float = ROUGHNESS["length"]
-    """Deviation of the positions, m."""
 
 
 def frames_of_axes(

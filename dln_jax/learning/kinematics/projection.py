@@ -21,7 +21,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.learning.kinematics.frames import Frames, displaced, free_directions
+from dln_jax.learning.kinematics.frames import Frames, displace, free_directions
 from dln_jax.mechanics.trees.scanned import Skeleton, scanned_forces, scanned_regressor
 from dln_jax.types import JointKind, Vector
 
@@ -71,13 +71,8 @@ class Structure(NamedTuple):
         return len(self.inertial) + len(self.joints) * (4 if self.friction else 1)
 
 
-class Samples(NamedTuple):
-    """States and torques, as arrays [N, d]."""
-
-    q: Any
-    qd: Any
-    qdd: Any
-    tau: Any
+Samples = tuple[Any, Any, Any, Any]
+"""q, qd, qdd and tau, as arrays [N, d]."""
 
 
 class Projection(NamedTuple):
@@ -139,7 +134,7 @@ def project(
     inertias = inertias_of(structure, linear)
 
     def force(step: Array, *state: Vector) -> Vector:
-        skeleton = Skeleton(structure.parents, structure.joints, structure.gravity, *displaced(frames, step))
+        skeleton = Skeleton(structure.parents, structure.joints, structure.gravity, *displace(frames, step))
         return scanned_forces(skeleton, inertias, *state) / unit
 
     still = jnp.zeros((tau.shape[1], 6), tau.dtype)
@@ -182,7 +177,7 @@ def compiled(structure: Structure, *, ridge: float) -> Program:
         step = jnp.linalg.solve(damped, state.at.slope)
         longest = jnp.max(jnp.abs(step) / lengths)
         step = step * jnp.minimum(1.0, LARGEST_STEP / jnp.maximum(longest, LARGEST_STEP))
-        frames = displaced(state.frames, jnp.zeros(6 * d).at[places].set(step).reshape(d, 6))
+        frames = displace(state.frames, jnp.zeros(6 * d).at[places].set(step).reshape(d, 6))
         at = project(structure, frames, samples, unit, ridge=ridge)
         lower = at.loss < state.at.loss  # false for NaN
         damping = jnp.clip(state.damping * jnp.where(lower, FEWER, MORE), LEAST_DAMPING, MOST_DAMPING)

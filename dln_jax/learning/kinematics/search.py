@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.learning.kinematics.frames import Frames, random_frames, rough_frames, turned_round
+from dln_jax.learning.kinematics.frames import Frames, KinematicPrior, random_frames, rough_frames, turn_round
 from dln_jax.learning.kinematics.projection import Descent, Program, Samples, Structure, descend
 from dln_jax.types import require_positive, require_seed
 
@@ -41,21 +41,8 @@ class Search(NamedTuple):
     """Whether to search until two descents end at the same arm, with the same validation error."""
     seed: int = 0
     threads: int = 2
-    kinematic_prior: Frames | None = None
-    """Kinematic prior: frames near which to start, for example from a drawing with link lengths and rough axes."""
-    prior_angle: float = 0.5
-    """Deviation of the prior's axes, rad."""
-    prior_length: float = 0.05
-    """Deviation of the prior's positions, m."""
-
-
-class Searched(NamedTuple):
-    """Descents so far."""
-
-    descents: list[Descent]
-    """Final states, lowest loss first."""
-    starts: int
-    """Number of random starts; the others are moves of the best."""
+    kinematic_prior: KinematicPrior | None = None
+    """Frames near which to start, for example from a drawing with link lengths and rough axes (default: anywhere)."""
 
 
 def search(
@@ -66,9 +53,11 @@ def search(
     settings: Search,
     *,
     until: float,
-    before: Searched = Searched([], 0),  # noqa: B008
-) -> Searched:
+    before: tuple[list[Descent], int] = ([], 0),
+) -> tuple[list[Descent], int]:
     """Descends from random starts, and from moves of the best, until enough descents agree on the lowest loss.
+
+    Returns the final states of all descents, lowest loss first, and the number of random starts among them.
 
     Args:
         program: descent of the structure, from `compiled`.
@@ -79,7 +68,9 @@ def search(
         InputError: a setting out of range.
     """
     counts = {name: getattr(settings, name) for name in ("starts", "agreement", "iterations", "seconds", "threads")}
-    require_positive(**counts, prior_angle=settings.prior_angle, prior_length=settings.prior_length)
+    require_positive(**counts)
+    if settings.kinematic_prior is not None:
+        require_positive(angle=settings.kinematic_prior.angle, length=settings.kinematic_prior.length)
     require_seed(settings.seed)
 
     def end(frames: Frames) -> Descent:
@@ -93,36 +84,35 @@ def search(
         while wave := list(itertools.islice(starts, WAVE)):
             descents = _sorted([*descents, *pool.map(end, wave)])
             done += len(wave)
-            if agreeing(descents) >= settings.agreement or time.perf_counter() > until:
+            if count_agreeing(descents) >= settings.agreement or time.perf_counter() > until:
                 break
         for joints in (1, 2):
-            while agreeing(descents) < settings.agreement and time.perf_counter() < until:
+            while count_agreeing(descents) < settings.agreement and time.perf_counter() < until:
                 best = descents[0]
                 descents = _sorted([*descents, *pool.map(end, _turns(structure, best.frames, joints))])
                 if not descents[0].at.loss < (1 - ALIKE) * best.at.loss:
                     break
-    return Searched(descents, done)
+    return descents, done
 
 
-def agreeing(descents: list[Descent]) -> int:
+def count_agreeing(descents: list[Descent]) -> int:
     """Number of descents that ended at the lowest loss."""
     return sum(float(descent.at.loss) <= (1 + ALIKE) * float(descents[0].at.loss) for descent in descents)
 
 
 def _starts(structure: Structure, settings: Search, first: int) -> Iterator[Frames]:
-    prior = settings.kinematic_prior
     for index in range(first, settings.starts):
         random = np.random.default_rng([settings.seed, index])
-        if prior is None:
+        if settings.kinematic_prior is None:
             yield random_frames(len(structure.joints), random)
         else:
-            yield rough_frames(prior, random, angle=settings.prior_angle, length=settings.prior_length)
+            yield rough_frames(settings.kinematic_prior, random)
 
 
 def _turns(structure: Structure, frames: Frames, joints: int) -> Iterable[Frames]:
     """Yields the frames with every combination of this number of joints reversed."""
     for chosen in itertools.combinations(range(len(structure.joints)), joints):
-        yield functools.reduce(lambda frames, joint: turned_round(frames, structure.parents, joint), chosen, frames)
+        yield functools.reduce(lambda frames, joint: turn_round(frames, structure.parents, joint), chosen, frames)
 
 
 def _sorted(descents: list[Descent]) -> list[Descent]:

@@ -26,8 +26,7 @@ from dln_jax.data.splits import (
     stated_test,
     with_joints,
 )
-from dln_jax.learning.measured_motions import MeasuredWindows, Noise
-from dln_jax.learning.motions import Weights
+from dln_jax.learning.shooting import MeasuredWindows, Noise, Weights
 from dln_jax.metrics.motions import cut_recordings, grid_places
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.types import InputError, Needs

@@ -12,11 +12,11 @@ import numpy as np
 from dln_jax.data.bodies import Order, arrangements, find_bodies
 from dln_jax.data.schema import Trajectories, column
 from dln_jax.data.splits import hold_out
-from dln_jax.learning import accelerations
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import loss_of
-from dln_jax.learning.rates import match_linear
+from dln_jax.learning.matching import match_linear
+from dln_jax.learning.objectives import TORQUE
 from dln_jax.learning.select import grow, segments
 from dln_jax.training.hamiltonian.measurements import MEASURED, forces_of
 from dln_jax.training.hamiltonian.recipes import RECIPES
@@ -212,7 +212,7 @@ def validation_errors(
     task = first_problem(problem, description, parts, 0)
     training = fit(task, GaussNewton(steps=TRIAL_STEPS), must_start=False)
     loss = loss_of(task)
-    keys = accelerations.KEYS if in_velocities(problem, description) else ("q", "p", "qd", "pd")
+    keys = TORQUE.keys if in_velocities(problem, description) else ("q", "p", "qd", "pd")
     # The loss of a batch of one sample is the squared error of that sample.
     batches = [column(parts[1], key)[:, None] for key in keys]
     errors = np.asarray(jax.jit(jax.vmap(lambda *batch: loss(training.parameters, batch)))(*batches))
@@ -225,5 +225,5 @@ def validation_errors(
 def mean_square_rates(problem: Problem, description: dict[str, Any], data: Trajectories) -> float:
     """Mean square of the rates, the reference for errors of a fit of rates."""
     if in_velocities(problem, description):
-        return float(data.degrees_of_freedom)  # `accelerations` divides by the spread
+        return float(data.degrees_of_freedom)  # `accelerations_problem` divides by the spread
     return float(np.mean(np.concatenate([data.qd, column(data, "pd")]) ** 2))

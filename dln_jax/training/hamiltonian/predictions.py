@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from dln_jax.figures.phase_space import Field, motion_figure
 from dln_jax.figures.style import TRUTH
-from dln_jax.learning.measured_motions import MeasuredWindows
+from dln_jax.learning.shooting import MeasuredWindows
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.motions import on_grid, padded, predict_measured, prediction_metrics
 from dln_jax.metrics.phase_space import (

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from dln_jax.learning.motions import Weights
+from dln_jax.learning.shooting import Weights
 from dln_jax.training.hamiltonian.tasks import MEASURED, REAL, WINDOW
 
 

@@ -7,10 +7,9 @@ import numpy as np
 
 from dln_jax.data.arrays import spread
 from dln_jax.data.schema import Trajectories, column
-from dln_jax.learning import accelerations, measured_motions, motions, rates
+from dln_jax.learning import matching, shooting
 from dln_jax.learning.engine import problem as engine
-from dln_jax.learning.measured_motions import Gauge, cut_measured_windows
-from dln_jax.learning.motions import Weights, Windows, cut_windows
+from dln_jax.learning.shooting import Gauge, Weights, Windows, cut_measured_windows, cut_windows
 from dln_jax.training.hamiltonian.measurements import ANCHOR
 from dln_jax.training.hamiltonian.recipes import RECIPES
 from dln_jax.training.hamiltonian.tasks import Problem
@@ -43,8 +42,10 @@ def first_problem(
     model, most = build(description), RECIPES[problem.name].samples
     if in_velocities(problem, description):
         initial = jax.jit(model.init)(jax.random.key(seed))
-        return accelerations.problem(model, initial, *parts, gauge=gauge_of(problem), most_samples=most, seed=seed)
-    return rates.problem(model, *parts, seed=seed, most_samples=most)
+        return matching.accelerations_problem(
+            model, initial, *parts, gauge=gauge_of(problem), most_samples=most, seed=seed
+        )
+    return matching.rates_problem(model, *parts, seed=seed, most_samples=most)
 
 
 def second_problem(
@@ -55,11 +56,11 @@ def second_problem(
     if problem.noise is not None and in_velocities(problem, description):
         known = {"noise": problem.noise, "gauge": gauge_of(problem), "substeps": recipe.substeps, "seed": seed}
         windows = [cut_measured_windows(part, recipe.window) for part in parts]
-        return measured_motions.problem(model, start, *windows, **known)
+        return shooting.measured_problem(model, start, *windows, **known)
     windows = [cut_windows(part, recipe.window) for part in parts]
     weights = weights_of(problem, parts[0])
     substeps = recipe.substeps if problem.trust is None else substeps_of(windows[0], weights)
-    return motions.problem(model, start, *windows, weights=weights, substeps=substeps, seed=seed)
+    return shooting.phase_problem(model, start, *windows, weights=weights, substeps=substeps, seed=seed)
 
 
 def weights_of(problem: Problem, data: Trajectories) -> Weights:

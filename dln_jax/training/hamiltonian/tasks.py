@@ -16,7 +16,7 @@ from jax import Array
 from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories, column
 from dln_jax.data.splits import select
-from dln_jax.learning.measured_motions import MeasuredWindows, Noise
+from dln_jax.learning.shooting import MeasuredWindows, Noise
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS, PhaseSamples, reference_motion
 from dln_jax.training.hamiltonian.measurements import (

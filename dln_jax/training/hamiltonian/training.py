@@ -16,14 +16,12 @@ from jax.sharding import Mesh
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import PER_SAMPLE, hold_out
-from dln_jax.learning import motions, rates
+from dln_jax.learning import matching, shooting
 from dln_jax.learning.engine import problem as engine
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser
 from dln_jax.learning.engine.problem import Progress, ProgressReport, Training, silent
-from dln_jax.learning.motions import cut_windows
-from dln_jax.learning.rates import match_linear
 from dln_jax.scale.mesh import of_first_process
 from dln_jax.training.hamiltonian.model_selection import EXACT, POLYNOMIAL, VALIDATION_SHARE, mean_square_rates
 from dln_jax.training.hamiltonian.recipes import RECIPES
@@ -88,10 +86,10 @@ def check(problem: Problem, description: dict[str, Any], *, seed: int) -> None:
         engine.require_finite_start(fitted, fitted.arrays)
         second_problem(problem, description, parts, fitted.parameters, seed)
         return
-    engine.require_finite_start(fitted, rates.samples(problem.fitted))
+    engine.require_finite_start(fitted, matching.phase_samples(problem.fitted))
     if recipe.trajectory_steps:
-        windows, validation = (cut_windows(part, recipe.window) for part in parts)
-        motions.arrays(windows, validation, weights_of(problem, parts[0]))
+        windows, validation = (shooting.cut_windows(part, recipe.window) for part in parts)
+        shooting.arrays(windows, validation, weights_of(problem, parts[0]))
 
 
 def train(
@@ -132,7 +130,7 @@ def train(
 
     parts = hold_out(problem.fitted, VALIDATION_SHARE, seed)
     if description["name"] == POLYNOMIAL:
-        first = match_linear(model, parts[0], validation=parts[1])[0]
+        first = matching.match_linear(model, parts[0], validation=parts[1])[0]
     else:
         first = fitted(RATES, first_problem(problem, description, parts, seed), recipe.steps, "rates", seconds)
     fits = {RATES: first}

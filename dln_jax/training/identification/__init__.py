@@ -1,1 +1,1 @@
-"""Identifies the parameters of a robot from logs."""
+"""Fits to motions, which identify and learned trees share."""

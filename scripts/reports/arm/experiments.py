@@ -30,7 +30,7 @@ from dln_jax.control.tracking import Gains, Reference, feed_forward, feedback
 from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.data.splits import every, label_indices, select
-from dln_jax.learning.online import Refit, appended, empty_replay, learn_online, make_linear_refit, make_refit
+from dln_jax.learning.online import Refit, append_recording, empty_replay, learn_online, make_linear_refit, make_refit
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.errors import mean_square
 from dln_jax.models.baselines import make_feed_forward
@@ -171,7 +171,7 @@ def fitted(
     replay = empty_replay(len(thin.t), data.degrees_of_freedom)
     for index in chosen:
         letter = select(thin, [index])
-        replay = appended(replay, letter.q, letter.qd, letter.qdd, letter.tau)
+        replay = append_recording(replay, letter.q, letter.qd, letter.qdd, letter.tau)
     return learner.refit(learner.start(seed), replay), states(select(thin, chosen))
 
 

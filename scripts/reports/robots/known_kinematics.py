@@ -24,9 +24,7 @@ from dln_jax.identification.excitation.design import CRITERIA, best_design, make
 from dln_jax.identification.excitation.limits import MotionLimits
 from dln_jax.identification.excitation.task import make_task
 from dln_jax.identification.identify import identify, parameters_of
-from dln_jax.learning.friction import fit_friction
-from dln_jax.learning.friction_selection import choose_terms
-from dln_jax.learning.friction_terms import terms_of
+from dln_jax.learning.friction import choose_terms, fit_friction, terms_of
 from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.weak_forms import fit_momentum
 from dln_jax.mechanics.equations import dynamics
@@ -145,11 +143,10 @@ def added_terms(*, logs_without: int = 20, logs_with: int = 5) -> Numbers:
 
     An arm of two joints moves for 20 s while its gears warm up; torques have noise of about 1 % of their size.
     """
-    options: dict[str, Any] = {"cooling": False, "motors": None, "coupled": ()}
-    terms = terms_of(PLANT_LAWS, None, (), **options)
+    terms = terms_of(PLANT_LAWS)
     candidates = {
         "coupled": terms._replace(coupled=((0, 1),)),
-        "load": terms_of(("load",), None, (), **options),
+        "load": terms_of(("load",)),
         "temperature": terms._replace(learned=("cooling",)),
     }
     numbers = {}

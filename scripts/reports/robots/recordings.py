@@ -26,7 +26,7 @@ from dln_jax.models.model import Parameters
 from dln_jax.models.trees import make_rigid_tree, tree_of
 from dln_jax.models.trigonometric import make_planar_chain
 from dln_jax.solvers import least_squares
-from dln_jax.training.identification.motions import MotionSets, fit_by
+from dln_jax.training.identification.motions import choose_window, refit
 from dln_jax.types import FrictionLaw, InputError, Needs
 from scripts.reports.robots.arm import Torque, error_of, regression, torque_of
 from scripts.reports.robots.known_kinematics import USUAL_SCALE
@@ -88,11 +88,11 @@ def identify_by(*, double_pendulum: Path | None = None, splits: int = len(HELD_O
     known: Parameters = model.init(jax.random.key(0))
 
     def fits(rest, held):
-        by_torques, sets = identify(model, known, rest[0]), MotionSets(rest[1], held[1])
-        by_motions, _, choice = fit_by("motions", model, known, by_torques, rest[0], sets, None)
-        by_both = by_torques
-        if choice.window is not None:
-            by_both, *_ = fit_by("both", model, known, by_torques, rest[0], sets, choice.window)
+        by_torques = identify(model, known, rest[0])
+        window, _ = choose_window("motions", model, known, *rest)
+        by_motions, by_both = (
+            refit(by, model, known, by_torques, rest[0], rest[1], window)[0] for by in ("motions", "both")
+        )
         measured = {"torques": by_torques, "motions": by_motions, "both": by_both}
         return {way: (model, parameters_of(solution.theta, known)) for way, solution in measured.items()}
 

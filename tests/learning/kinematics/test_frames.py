@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from dln_jax.learning.kinematics.frames import (
-    mirrored,
+    KinematicPrior,
+    mirror_image,
     random_frames,
     rough_frames,
-    turned_round,
+    turn_round,
 )
 from dln_jax.mechanics.trees.description import make_tree
 from dln_jax.mechanics.trees.frames import world_frames
@@ -34,7 +35,7 @@ def frames():
 def test_a_joint_turned_round_moves_all_behind_it_the_other_way(frames):
     links = np.ones((4, 10))
     for joint, q in enumerate(0.8 * np.eye(4)):
-        one, other = tree(frames, links), tree(turned_round(frames, PARENTS, joint), links)
+        one, other = tree(frames, links), tree(turn_round(frames, PARENTS, joint), links)
         found, expected = (world_frames(each, jnp.asarray(sign * q))[1] for each, sign in ((one, 1), (other, -1)))
         np.testing.assert_allclose(found, expected, atol=1e-12)
 
@@ -48,7 +49,7 @@ def test_the_mirror_image_takes_the_same_torques(frames):
         m, h, moments = parts(theta)
         moments = mirror @ moments @ mirror
         flipped.append([m, *(mirror @ h), *moments[np.triu_indices(3)]])
-    image = tree(mirrored(frames, PARENTS, KINDS), np.array(flipped))
+    image = tree(mirror_image(frames, PARENTS, KINDS), np.array(flipped))
     states = np.random.default_rng(2).normal(size=(3, 2, 4))
     original = tree(frames, inertias)
     found, expected = (jax.jit(jax.vmap(functools.partial(newton_euler, each)))(*states) for each in (image, original))
@@ -56,7 +57,7 @@ def test_the_mirror_image_takes_the_same_torques(frames):
 
 
 def test_rough_frames_are_as_far_off_as_is_said(frames):
-    found = rough_frames(frames, np.random.default_rng(3), angle=0.3, length=0.1)
+    found = rough_frames(KinematicPrior(frames, 0.3, 0.1), np.random.default_rng(3))
     np.testing.assert_allclose(np.linalg.norm(found.positions - frames.positions, axis=1), 0.1, atol=1e-12)
     between = np.swapaxes(frames.rotations, 1, 2) @ found.rotations
     np.testing.assert_allclose(np.trace(between, axis1=1, axis2=2), 1 + 2 * np.cos(0.3), atol=1e-12)

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.learning.kinematics.frames import Frames, displaced, free_directions, random_frames
-from dln_jax.learning.kinematics.projection import Samples, Structure, design, project
+from dln_jax.learning.kinematics.frames import Frames, displace, free_directions, random_frames
+from dln_jax.learning.kinematics.projection import Structure, design, project
 from dln_jax.mechanics.trees.description import make_tree
 from dln_jax.mechanics.trees.recursions import newton_euler
 
@@ -24,7 +24,7 @@ def problem():
     state = random.normal(size=(3, 40, 3))
     linear = random.normal(size=STRUCTURE.linear_count)
     frames = Frames(*map(jnp.asarray, frames))
-    return frames, Samples(*state, np.asarray(columns(frames, *state)) @ linear), linear
+    return frames, (*state, np.asarray(columns(frames, *state)) @ linear), linear
 
 
 @jax.jit
@@ -41,7 +41,7 @@ def projected(step, further=None):
 @jax.jit
 def projected_from(frames, samples, step, further):
     for each in (step, further):
-        frames = frames if each is None else displaced(frames, each.reshape(3, 6))
+        frames = frames if each is None else displace(frames, each.reshape(3, 6))
     return project(STRUCTURE, frames, samples, UNIT, ridge=1e-12)
 
 
@@ -58,7 +58,7 @@ def test_the_design_has_all_that_a_tree_shows():
 
 def test_slopes_are_those_of_finite_differences():
     places = free_directions(STRUCTURE.parents, KINDS)
-    samples = problem()[1].tau.size
+    samples = problem()[1][-1].size
     start = jnp.zeros(18).at[places].set(0.1 * np.random.default_rng(1).normal(size=len(places)))
     at = projected(start)
     for place, slope in zip(places, at.slope, strict=True):
@@ -73,7 +73,7 @@ def test_near_the_solution_kaufmans_matrix_is_the_curvature():
     direction = np.random.default_rng(2).normal(size=len(places))
     step = 1e-4 * jnp.zeros(18).at[places].set(direction)
     predicted = 1e-8 * direction @ at.normal @ direction
-    assert float(projected(step).loss) * problem()[1].tau.size == pytest.approx(float(predicted), rel=1e-2)
+    assert float(projected(step).loss) * problem()[1][-1].size == pytest.approx(float(predicted), rel=1e-2)
 
 
 def test_gauges_change_nothing():

@@ -1,10 +1,10 @@
-"""Two trees are the same arm if one can be moved, mirrored and turned about its axes to become the other."""
+"""Two trees are the same arm if one can be moved, mirror_image and turned about its axes to become the other."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dln_jax.learning.kinematics.agreement import difference
-from dln_jax.learning.kinematics.frames import Frames, mirrored, random_frames, turned_round
+from dln_jax.learning.kinematics.frames import Frames, mirror_image, random_frames, turn_round
 from dln_jax.learning.kinematics.projection import Structure
 
 D = 4
@@ -37,7 +37,7 @@ def test_gauges_make_no_difference():
         if parallel:
             level = Rotation.from_rotvec([np.pi / 2, 0, 0]).as_matrix()
             frames = frames._replace(rotations=np.stack([level, *[np.eye(3)] * (D - 1)]))
-        off = difference(frames, mirrored(regauged(frames, random), CHAIN.parents, CHAIN.joints), CHAIN)
+        off = difference(frames, mirror_image(regauged(frames, random), CHAIN.parents, CHAIN.joints), CHAIN)
         assert off.angle < 1e-5 and off.length < 1e-5 and off.same
 
 
@@ -47,5 +47,5 @@ def test_other_arms_differ_by_what_they_were_moved():
     positions[2] += 0.1 * np.asarray(frames.rotations[2])[:, 0]
     moved = difference(frames, frames._replace(positions=positions), CHAIN)
     assert 0.02 < moved.length <= 0.1 and not moved.same
-    reversed_joint = difference(frames, turned_round(frames, CHAIN.parents, 1), CHAIN)
+    reversed_joint = difference(frames, turn_round(frames, CHAIN.parents, 1), CHAIN)
     assert reversed_joint.angle > 0.5 and not reversed_joint.same

@@ -1,19 +1,21 @@
 """Judges an identified robot: its torques on held-out motions, and its physical plausibility."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.data.encoders.sampling import torque_noise
+from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import every
 from dln_jax.identification.identify import Identification, parameters_of
 from dln_jax.identification.shared_motors import MOST, shared_motor
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.metrics.verdict import WORSE, Verdict, held_out, judge, verdict_metrics, worst
+from dln_jax.models.model import Parameters
 from dln_jax.models.trees import RigidTreeParameters
-from dln_jax.training.identification.additions import Predict
-from dln_jax.training.identification.task import Case
+from dln_jax.zoo.descriptions import Description
 
 HEAVIER, MUCH_HEAVIER = 5.0, 50.0
 """Factors by which the bodies' torques may differ from those of the robot's file: beyond the first the fit is doubtful,
@@ -33,53 +35,71 @@ SPIKES = 5e-4
 """Spikes are reported if their fraction is larger."""
 
 
-def judged(
-    case: Case, solution: Identification, predict: Predict, torques: dict[str, np.ndarray], kept: str,
-    *, robust: bool, moves: bool,
-) -> tuple[Verdict, dict[str, float | int]]:  # fmt: skip
+Predict = Callable[[Parameters, Trajectories], tuple[np.ndarray, np.ndarray]]
+"""(parameters, data) -> torque and friction [N, d]."""
+
+
+def judge_robot(
+    solution: Identification,
+    known: Parameters,
+    description: Description,
+    predict: Predict,
+    train: Trajectories,
+    test: Trajectories,
+    torques: dict[str, np.ndarray],
+    names: tuple[str, ...],
+    *,
+    noise: np.ndarray | None,
+    causes: tuple[str, ...],
+    robust: bool,
+    whole: bool,
+) -> tuple[Verdict, dict[str, float | int]]:
     """The verdict on an identified robot, and its entries of metrics.json.
 
     Args:
-        predict: torques by parameters.
-        torques: torques on the held-out motions [N, d], by "file", "least_squares" and `kept`.
-        kept: key of the torques of the model that the run keeps.
+        known: parameters in the robot's file.
+        torques: torques on the held-out motions [N, d], by "file", "least_squares" and "identified".
+        noise: standard deviation of the torques' noise [d].
+        causes: faults of the log that no filter repairs.
         robust: whether spikes in held-out samples are ignored.
-        moves: whether a fit to motions predicts the held-out ones to their ends.
+        whole: whether a fit to motions predicts the held-out ones to their ends.
     """
-    test, d = case.sets.test, case.sets.test.degrees_of_freedom
-    peaks = spikes(test.tau)
-    rows = ~peaks.any(axis=1) if robust else np.ones(len(test.t), bool)
-    noise = case.filtered_noise if case.noise is None else case.noise
-    noise = torque_noise(case.sets.train) if noise is None else noise
-    errors = held_out(torques[kept][rows], test.tau[rows], noise=noise, file=torques["file"][rows])
-    by_torques = judge(errors, case.names)
-    if moves and by_torques.level == "doubtful":
+    fitted, d = torques["identified"], test.degrees_of_freedom
+    rows = ~spikes(test.tau).any(axis=1) if robust else np.ones(len(test.t), bool)
+    errors = held_out(fitted[rows], test.tau[rows], noise=noise, file=torques["file"][rows])
+    by_torques = judge(errors, names)
+    if whole and by_torques.level == "doubtful":
         # A fit to motions may deviate from filtered torques by more than their noise: the filter moves them too.
-        by_torques = judge(errors._replace(noise=None), case.names)
-    verdicts = [by_torques, existing(solution, torques, kept, test.tau)]
-    mine = parameters_of(solution.theta, case.known)
+        by_torques = judge(errors._replace(noise=None), names)
+    mine = parameters_of(solution.theta, known)
     still = np.zeros_like(test.q)
-    friction = predict(mine, still, test.qd, still).friction
-    scales = case.description.get("velocity_scale") if {"coulomb", "stribeck"} & set(case.laws) else None
-    fitted = np.array(scales) if isinstance(scales, list) else None
-    verdicts += [friction_verdict(case.names, test.qd, test.tau, friction, fitted)]
-    bodies = [predict(without_joints(theta), test.q, test.qd, test.qdd).torque for theta in (mine, case.known)]
-    verdicts += [weight_verdict(*bodies)]
-    verdict = worst(*verdicts, causes=case.causes)
-    if verdict.level != "good" and case.description["motors"] is None:
-        train = every(case.sets.train, -(-len(case.sets.train.t) // MOST))
-        motor = shared_motor(train.tau - predict(mine, train.q, train.qd, train.qdd).torque, train.qd)
+    friction = predict(mine, test._replace(q=still, qdd=still))[1]
+    scales = description["velocity_scale"]
+    stated = not isinstance(scales, list) or not {"coulomb", "stribeck"} & set(description["needs"]["joint_friction"])
+    bodies = [predict(without_joints(theta), test)[0] for theta in (mine, known)]
+    verdict = worst(
+        by_torques,
+        consistent_verdict(solution, fitted, torques["least_squares"], test.tau),
+        friction_verdict(names, test.qd, test.tau, friction, None if stated else np.array(scales)),
+        weight_verdict(*bodies),
+        causes=causes,
+    )
+    if verdict.level != "good" and description["motors"] is None:
+        thin = every(train, -(-len(train.t) // MOST))
+        motor = shared_motor(thin.tau - predict(mine, thin)[0], thin.qd)
         if motor is not None:
-            names = [case.names[k] for k in (motor.joint, motor.other)]
-            rows = ";".join(",".join(f"{entry:g}" for entry in row) for row in motor.rates(d))
+            joint, other, ratio, explained = motor
+            S = np.eye(d)
+            S[joint, other] = ratio
+            rows = ";".join(",".join(f"{entry:g}" for entry in row) for row in S)
             remedy = (
-                f"friction of a motor that turns with {names[0]} and {motor.ratio:g} times {names[1]} would explain "
-                f"{motor.share:.0%} of what is left in both: try --motors '{rows}'"
+                f"friction of a motor that turns with {names[joint]} and {ratio:g} times {names[other]} would explain "
+                f"{explained:.0%} of what is left in both: try --motors '{rows}'"
             )
-            verdict = Verdict(verdict.level, verdict.reason, f"{remedy}; else {verdict.remedy}")
-    share = spikes(case.sets.train.tau).mean(axis=0)
+            verdict = verdict._replace(remedy=f"{remedy}; else {verdict.remedy}")
+    share = spikes(train.tau).mean(axis=0)
     if verdict.level != "good" and not robust and share.max() > SPIKES:
-        which = ", ".join(case.names[k] for k in range(d) if share[k] > SPIKES)
+        which = ", ".join(names[k] for k in range(d) if share[k] > SPIKES)
         reason = f"{share.max():.2%} of the torques of {which} are spikes: {verdict.reason}"
         verdict = Verdict(verdict.level, reason, f"give --robust; else {verdict.remedy}")
     return verdict, verdict_metrics(errors, verdict)
@@ -96,15 +116,13 @@ def spikes(tau: Float[np.ndarray, "N d"]) -> np.ndarray:
     return away > np.maximum(SPIKE * usual, 2 * size)
 
 
-def existing(solution: Identification, torques: dict[str, np.ndarray], kept: str, tau: np.ndarray) -> Verdict:
-    """Whether physically consistent bodies explain the torques as well as unconstrained least squares."""
-    if solution.consistent is None:
+def consistent_verdict(solution: Identification, fitted: np.ndarray, free: np.ndarray, tau: np.ndarray) -> Verdict:
+    """Whether physically consistent bodies explain the torques [N, d] as well as unconstrained least squares."""
+    mine, least = (np.nanmean(normalised_error(torque, tau)) for torque in (fitted, free))
+    if solution.consistent is None or mine <= 2 * least + WORSE:
         return Verdict("good", "")
-    mine, free = (np.nanmean(normalised_error(torques[name], tau)) for name in (kept, "least_squares"))
-    if mine <= 2 * free + WORSE:
-        return Verdict("good", "")
-    level = "refused" if mine > free + IMPOSSIBLE else "doubtful"
-    reason = f"physically consistent bodies have an nMSE of {mine:.3g}, least squares without that bound {free:.3g}"
+    level = "refused" if mine > least + IMPOSSIBLE else "doubtful"
+    reason = f"physically consistent bodies have an nMSE of {mine:.3g}, least squares without that bound {least:.3g}"
     if not solution.consistent.converged:
         reason += f", not converged after {solution.consistent.iterations} iterations"
     remedy = "check the signs and units of tau and the robot's file: no robot has such torques"
@@ -123,7 +141,7 @@ def friction_verdict(
     power = np.mean(qd * (friction - friction.mean(axis=0)), axis=0)
     for k in np.flatnonzero(counts & (power < 0)):
         reason = f"friction of {names[k]} drives it: {-power[k]:.3g} W on average"
-        every.append(Verdict("refused", reason, "check the signs of tau and qd; keep --consistent"))
+        every.append(Verdict("refused", reason, "check the signs of tau and qd"))
     if scales is not None:
         for k in np.flatnonzero(counts & (scales > np.quantile(np.abs(qd), FAST, axis=0))):
             reason = f"{names[k]} hardly reaches {scales[k]:.3g}/s, the velocity scale of its dry friction"

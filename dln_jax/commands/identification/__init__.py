@@ -1,0 +1,1 @@
+"""Parts of the command identify: its log, its fit, and its verdict."""

@@ -1,0 +1,148 @@
+"""Derivative matching: fits a model to measured or estimated rates of its states.
+
+    loss = mean over samples and components of |rates(q, p) - (qd, pd)|²           (phase fields)
+    residual = (qdd_hat(q, qd, tau) - qdd) / spread of qdd                         (accelerations)
+
+The first is the published loss of Hamiltonian networks (Greydanus, Dzamba and Yosinski 2019). It is minimised by
+Gauss-Newton, Adam, or, for a field that is linear in its parameters, by one least-squares problem. The validation
+trajectories, drawn from those for training, select the parameters; no test data are read. If states are noisy and rates
+are not, the loss has a bias that more data do not remove: it flattens the field (regression dilution).
+
+The second works with or without torques. Where accelerations are exact, this fit alone is enough; otherwise it is the
+first fit for `learning.shooting`, whose result does not depend on estimated derivatives.
+"""
+
+import functools
+import math
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.data.arrays import on_device, spread
+from dln_jax.data.schema import Trajectories, momenta
+from dln_jax.data.splits import select_samples
+from dln_jax.learning.engine.problem import Problem, Progress, Stop, Training, arrays_of, selected_by
+from dln_jax.learning.objectives import TORQUE
+from dln_jax.learning.shooting import Gauge, check_gauge, gauge_error
+from dln_jax.mechanics.equations import dynamics, flow
+from dln_jax.models.model import Model, Parameters
+from dln_jax.solvers import least_squares
+from dln_jax.types import require_positive, require_seed
+
+
+def rate_residual(model: Model, parameters: Parameters, q: Array, p: Array, qd: Array, pd: Array) -> Array:
+    """(rates - (qd, pd)) / sqrt(2 d) of one sample [2 d]; the sum of its squares is the sample's part of the loss."""
+    velocity, force = flow(model.energies(parameters)).rates(q, p)
+    return jnp.concatenate([velocity - qd, force - pd]) / math.sqrt(2 * q.shape[0])
+
+
+def rates_problem(
+    model: Model, train: Trajectories, validation: Trajectories, *, seed: int = 0, most_samples: int = 10_000
+) -> Problem:
+    """Builds the problem of fitting a model to the rates of trajectories, in the precision of the model.
+
+    Args:
+        model: a phase model.
+        train: trajectories with p and pd.
+        validation: trajectories that select the parameters, with p and pd; `data.splits.hold_out` draws some.
+        seed: seed of the initial parameters, of the drawn samples, and of their order.
+        most_samples: largest number of samples to fit, and to validate; larger sets are subsampled at random.
+
+    Raises:
+        InputError: no p or pd in the data, numbers whose squares overflow, or settings out of range.
+    """
+    require_positive(most_samples=most_samples)
+    require_seed(seed)
+    parameters = jax.jit(model.init)(jax.random.key(seed))
+    dtype = jnp.result_type(*jax.tree.leaves(parameters))
+    fitted, held_out = (
+        phase_samples(part, dtype, np.random.default_rng(seed).permutation(len(part.t))[:most_samples])
+        for part in (train, validation)
+    )
+    return selected_by(held_out, functools.partial(rate_residual, model), parameters, fitted, seed)
+
+
+def match_linear(
+    model: Model, data: Trajectories, *, validation: Trajectories | None = None
+) -> tuple[Training, Float[np.ndarray, " N"]]:
+    """Fits a field that is linear in its parameters by least squares, in float64, and returns the validation errors.
+
+    The errors are the squared errors of the validation samples, or of the fitted ones without a validation.
+
+    Raises:
+        InputError: no p or pd in the data, or numbers that are not finite or whose squares are not.
+    """
+    began = time.perf_counter()
+    with jax.enable_x64(True):
+        zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), jax.eval_shape(model.init, jax.random.key(0)))
+        columns = jax.jit(jax.jacrev(lambda c, *sample: rate_residual(model, c, *sample)))
+        arrays = phase_samples(data)
+        design = np.asarray(jax.jit(jax.vmap(columns, in_axes=(None, 0, 0, 0, 0)))(zero, *arrays))
+        target = -np.asarray(jax.jit(jax.vmap(functools.partial(rate_residual, model, zero)))(*arrays))
+        solution = least_squares.solve(design.reshape(-1, design.shape[-1]), target.ravel())
+        seconds = time.perf_counter() - began
+        judged = arrays if validation is None else phase_samples(validation)
+        errors = jax.vmap(functools.partial(rate_residual, model, jnp.asarray(solution.x)))(*judged)
+        squares = np.sum(np.asarray(errors) ** 2, axis=1)
+    fitted = solution.residual**2 / len(arrays[0])
+    at = Progress(1, fitted, float(squares.mean()), float("nan"), seconds)
+    return Training(jnp.asarray(solution.x), [at], Stop("finished", 1), 1, 0.0), squares
+
+
+def phase_samples(data: Trajectories, dtype: Any = jnp.float64, chosen: Any = slice(None)) -> tuple[Array, ...]:
+    """q, p, qd, pd of all samples, or of those chosen, on the device; `InputError` without p or pd, or on overflow."""
+    p, pd = momenta(data)
+    named = {"q": data.q, "p": p, "qd": data.qd, "pd": pd}
+    return tuple(on_device(name, array[chosen], dtype) for name, array in named.items())
+
+
+def accelerations_problem(
+    model: Model,
+    parameters: Parameters,
+    data: Trajectories,
+    validation: Trajectories,
+    *,
+    gauge: Gauge | None = None,
+    most_samples: int = 4_000,
+    seed: int = 0,
+) -> Problem:
+    """Builds the problem of fitting a model to accelerations, in float64.
+
+    Args:
+        model: built from any energies, or from accelerations, with float64 parameters.
+        data: training samples; if there are more than `most_samples`, a random subset is drawn.
+        validation: samples that select the parameters.
+        gauge: fixes the scale of the energies; needed only for motions without torques.
+        seed: seed of the draw and of the order of the samples.
+
+    Raises:
+        InputError: the data have no torques and there is no gauge, or numbers are too large.
+    """
+    require_positive(most_samples=most_samples)
+    check_gauge(gauge, data.tau, data.degrees_of_freedom)
+    size = spread("qdd", data.qdd)
+    scale = jnp.asarray(np.where(size > 0, size, 1.0))
+
+    def error(parameters: Parameters, q: Array, qd: Array, qdd: Array, tau: Array) -> Array:
+        return (dynamics(model.energies(parameters)).forward_dynamics(q, qd, tau) - qdd) / scale
+
+    def residual(parameters: Parameters, *sample: Array) -> Array:
+        return jnp.append(error(parameters, *sample), gauge_error(dynamics(model.energies(parameters)), gauge))
+
+    fitted, held_out = (
+        arrays_of(select_samples(part, _drawn(len(part.t), most_samples, seed)), TORQUE.keys)
+        for part in (data, validation)
+    )
+    return selected_by(held_out, residual, parameters, fitted, seed, error=error)
+
+
+def _drawn(samples: int, most: int, seed: int) -> np.ndarray:
+    """Indices of `most` random samples in ascending order, or of all samples if there are no more than that."""
+    if samples <= most:
+        return np.arange(samples)
+    return np.sort(np.random.default_rng(seed).choice(samples, size=most, replace=False))

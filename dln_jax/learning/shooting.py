@@ -1,0 +1,381 @@
+"""Trajectory matching: fits a model so that its motions pass through the measurements (multiple shooting).
+
+Trajectories are cut into short windows. A window's motion starts at a state z_w that is itself unknown:
+
+    minimise over theta and all z_w:   sum over windows and samples of |(x(t; z_w, theta) - x_measured) / noise|²
+
+(Bock 1981; Hairer, Norsett and Wanner 1993, section II.6.) No derivative is estimated and no noise is differentiated.
+Free starts average out noise, whereas derivative matching evaluates the field at noisy states and is biased. Windows
+never reach across a gap, that is, a time step of more than 1.5 times the median.
+
+**Phase fields** have the state x = (q, p), and their loss may add |(rates(x) - rates_measured) / rate_noise|². Their
+problem has theta and all starts as parameters. Gauss-Newton solves for all at once; its matrix has a row for every
+unknown. Adam, for networks that are too large for that, takes batches of windows, and the cost of its steps does not
+depend on the number of windows.
+
+**Measured coordinates** have the state (q, qd), with or without torques. Momenta p = dL/dqd are the model's own, so
+coupled joints are no harder than a single one, and any energies of `mechanics.equations.dynamics` work. qd counts only
+if it was measured. The problem's parameters are the model's alone, for any number of windows: starts are eliminated
+window by window (`without_start`), by
+
+    z(theta) = argmin over z of |r(theta, z)|²,   dr/dtheta = (1 - U Uᵀ) dr/dtheta at fixed z,   U a basis of dr/dz
+
+This is the derivative of Kaufman (1975, "A variable projection method for solving separable nonlinear least squares
+problems"), which omits a term that is small if the residual is.
+
+Torque errors drive simulated motions off course. With `Noise.tau` every window has an unknown constant torque e_w and a
+residual e_w / noise_tau: a compromise between matching motions under exact torques and torques of exact motions.
+
+Motion without torques fits any multiple of an energy: a `Gauge` fixes the multiple.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import window_indices
+from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by
+from dln_jax.mechanics.discrete import Torque, driven, torque_slopes
+from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainDynamics, PlainFlow
+from dln_jax.mechanics.equations import dynamics, flow
+from dln_jax.mechanics.integrators import looped_rk4, rk4, rollout
+from dln_jax.models.model import Model, Parameters
+from dln_jax.solvers.elimination import solve
+from dln_jax.types import InputError, require_positive
+
+START_STEPS = 3
+"""Gauss-Newton steps from the measured start of a window to the nearest one."""
+GAUGE_TOLERANCE = 0.01
+"""Relative distance from a gauge that counts as one standard deviation; the fit meets the gauge exactly."""
+
+
+class Windows(NamedTuple):
+    """W windows of equal length; shorter ones repeat their last sample with weight zero."""
+
+    t: np.ndarray
+    """Time since the window's first sample [W, T], in s."""
+    state: np.ndarray
+    """Measured (q, p) [W, T, 2 d]."""
+    rate: np.ndarray | None
+    """Measured (qd, pd) [W, T, 2 d]."""
+    weight: np.ndarray
+    """1 for a sample, 0 for a repeated one [W, T]."""
+
+
+class Weights(NamedTuple):
+    """Standard deviations that divide the residuals; a larger one gives less weight."""
+
+    state: tuple[float, ...] | float
+    """Standard deviations of q and p, one number or 2 d; infinite for quantities that were not measured."""
+    rate: tuple[float, ...] | float | None = None
+    """Standard deviations of qd and pd, one number or 2 d; `None` leaves measured rates out."""
+
+
+def cut_windows(data: Trajectories, length: int) -> Windows:
+    """Cuts consecutive windows of `length` samples; a window begins with the last sample of the one before.
+
+    Windows lie within segments without a gap. The remainder of a segment is a shorter window.
+
+    Raises:
+        InputError: a length below 2, no momenta, or no two samples without a gap between them.
+    """
+    if data.p is None:
+        raise InputError("the data have no p; add momenta, or rates in their place (per unit of mass)")
+    indices, weight = window_indices(data, length)
+    state = np.concatenate([data.q, data.p], axis=1)[indices]
+    rate = None if data.pd is None else np.concatenate([data.qd, data.pd], axis=1)[indices]
+    t = data.t[indices]
+    return Windows(t - t[:, :1], state, rate, weight)
+
+
+def phase_motion(
+    field: Flow | PlainFlow, start: Array, t: Float[Array, " T"], *, substeps: int
+) -> Float[Array, "T two_d"]:
+    """States (q, p) at the times t from `start` [2 d], by RK4."""
+    d = start.shape[0] // 2
+    q, p = rollout(rk4(lambda t, state: field.rates(*state)), (start[:d], start[d:]), t, substeps=substeps)
+    return jnp.concatenate([q, p], axis=1)
+
+
+def window_residual(
+    field: Flow | PlainFlow, start: Array, window: tuple[Array, ...], *, weights: Weights, substeps: int
+) -> Array:
+    """Weighted residuals of one window (t, state, weight[, rate]); their squares sum to a mean over its samples."""
+    t, measured, weight, *rate = window
+    states = phase_motion(field, start, t, substeps=substeps)
+    errors = [(states - measured) / jnp.asarray(weights.state, start.dtype)]
+    if weights.rate is not None:
+        q, p = jnp.split(states, 2, axis=1)
+        rates = jnp.concatenate(jax.vmap(field.rates)(q, p), axis=1)
+        errors.append((rates - rate[0]) / jnp.asarray(weights.rate, start.dtype))
+    return weigh(weight, *errors)
+
+
+def weigh(weight: Array, *errors: Array) -> Array:
+    """Concatenates errors [T, n] of a window, weighted so that their squares sum to a mean over its samples."""
+    size = jnp.sqrt(weight / jnp.sum(weight))[:, None]
+    return jnp.concatenate([jnp.ravel(size * error) for error in errors])
+
+
+def phase_problem(
+    model: Model,
+    parameters: Parameters,
+    windows: Windows,
+    validation: Windows,
+    *,
+    weights: Weights,
+    substeps: int = 4,
+    seed: int = 0,
+) -> Problem:
+    """Builds the problem of fitting a model to windows, in float64, with parameters {"model": ..., "starts": ...}.
+
+    The validation windows select the parameters, by the distance of simulated motions after fitting their starts too.
+
+    Args:
+        model: a phase model with float64 parameters.
+        parameters: initial parameters, for example from a fit of rates.
+        validation: windows that select the parameters.
+        weights: standard deviations that divide the residuals.
+        substeps: RK4 steps between two samples.
+
+    Raises:
+        InputError: no windows, weights that are not positive, or rates that the windows lack.
+    """
+    require_positive(substeps=substeps)
+    fitted, held_out = arrays(windows, validation, weights)
+    error = functools.partial(window_residual, weights=weights, substeps=substeps)
+
+    def residual(unknowns, index: Array, *window: Array) -> Array:
+        return error(flow(model.energies(unknowns["model"])), unknowns["starts"][index], window)
+
+    def closest(unknowns, *window: Array) -> Array:
+        from_start = functools.partial(error, flow(model.energies(unknowns["model"])), window=window)
+        return from_start(nearest(from_start, window[1][0]))
+
+    unknowns = {"model": parameters, "starts": fitted[1][:, 0]}
+    return selected_by(held_out, residual, unknowns, (jnp.arange(len(windows.t)), *fitted), seed, error=closest)
+
+
+def arrays(windows: Windows, validation: Windows, weights: Weights) -> list[tuple[Array, ...]]:
+    """Returns the arrays of both sets that a fit reads, on the device.
+
+    Raises:
+        InputError: as for `phase_problem`.
+    """
+    require_windows(windows, validation, state_weight=weights.state, rate_weight=weights.rate)
+    if weights.rate is not None and (windows.rate is None or validation.rate is None):
+        raise InputError("the weights count rates, which the windows lack; leave their weight out")
+    keys = ("t", "state", "weight", *(["rate"] if weights.rate is not None else []))
+    return [arrays_of(part, keys, jnp.result_type(float)) for part in (windows, validation)]
+
+
+def require_windows(windows: Any, validation: Any, **deviations: tuple[float, ...] | float | None) -> None:
+    """Raises `InputError` for a set without windows, or a standard deviation that is not positive."""
+    for name, values in deviations.items():
+        for deviation in np.ravel(values) if values is not None else ():
+            require_positive(**{name: float(deviation)})
+    if not len(windows.t) or not len(validation.t):
+        raise InputError(f"{len(windows.t)} windows to fit, {len(validation.t)} to validate; expected some of each")
+
+
+def without_start(frozen: Callable[[Array], Array], residual: Callable[[Array], Array], start: Array) -> Array:
+    """Returns the residual at its nearest start; its derivative in the parameters that `frozen` fixes is Kaufman's.
+
+    Args:
+        frozen: start -> residual, with constant parameters.
+        residual: the same function, differentiable in the parameters.
+        start: initial value.
+    """
+    start, slope = jax.lax.stop_gradient(_descend(frozen, start, START_STEPS))
+    left = residual(start)
+    change = left - jax.lax.stop_gradient(left)  # zero, with the derivative of `left`
+    return left - slope @ solve(slope.T @ slope, slope.T @ change)
+
+
+def nearest(residual: Callable[[Array], Array], start: Array, *, steps: int = START_STEPS) -> Array:
+    """Returns a start of lower residual, by steps of Gauss-Newton."""
+    return _descend(residual, start, steps)[0]
+
+
+def _descend(residual: Callable[[Array], Array], start: Array, steps: int) -> tuple[Array, Array]:
+    """Returns the start after some steps, and dr/dz at the beginning of the last one."""
+    linearised = jax.jacfwd(lambda start: (residual(start),) * 2, has_aux=True)
+
+    def step(at: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
+        slope, value = linearised(at[0])
+        return (at[0] - solve(slope.T @ slope, slope.T @ value), slope), None
+
+    nothing = jnp.zeros((jax.eval_shape(residual, start).shape[0], start.shape[0]), start.dtype)
+    return jax.lax.scan(step, (start, nothing), length=steps)[0]
+
+
+class MeasuredWindows(NamedTuple):
+    """W windows of equal length; shorter ones repeat their last sample with weight zero."""
+
+    t: np.ndarray
+    """Time since the window's first sample [W, T], in s."""
+    q: np.ndarray
+    """[W, T, d]."""
+    qd: np.ndarray
+    """[W, T, d], measured, or an estimate that only provides the initial start."""
+    tau: np.ndarray
+    """[W, T, d]."""
+    weight: np.ndarray
+    """1 for a sample, 0 for a repeated one [W, T]."""
+
+
+class Noise(NamedTuple):
+    """Standard deviations of the measurements, one per coordinate or one for all."""
+
+    q: tuple[float, ...] | float
+    qd: tuple[float, ...] | float | None = None
+    """`None` if velocities were not measured."""
+    tau: tuple[float, ...] | float | None = None
+    """Standard deviation of the mean torque over a window; `None` if torques are exact. The torque error is then
+    an unknown of every window, like its start."""
+
+
+class Gauge(NamedTuple):
+    """Fixes the multiple of an energy, which motions without torques leave free."""
+
+    q: tuple[float, ...]
+    """Position where the mass matrix is evaluated."""
+    mass: float = 1.0
+    """Mean of its diagonal there, kg m² or kg."""
+
+
+def cut_measured_windows(data: Trajectories, length: int) -> MeasuredWindows:
+    """Cuts consecutive windows of `length` samples within segments without a gap.
+
+    Raises:
+        InputError: a length below 2, or no two samples without a gap between them.
+    """
+    indices, weight = window_indices(data, length)
+    t = data.t[indices]
+    return MeasuredWindows(t - t[:, :1], data.q[indices], data.qd[indices], data.tau[indices], weight)
+
+
+def motion(
+    system: Dynamics | PlainDynamics,
+    start: Float[Array, " two_d"],
+    t: Float[Array, " T"],
+    tau: Float[Array, "T d"] | None = None,
+    *,
+    torque: Torque = "interpolated",
+    substeps: int = 1,
+) -> Float[Array, "T two_d"]:
+    """States (q, qd) at the times t from `start`, by RK4, with or without torques."""
+    d = start.shape[0] // 2
+    driving = jnp.zeros((t.shape[0], d), start.dtype) if tau is None else tau
+
+    def rate(state: tuple[Array, Array], tau: Array) -> tuple[Array, Array]:
+        q, qd = state
+        return qd, system.forward_dynamics(q, qd, tau)
+
+    slopes = torque_slopes(driving, t, torque)
+    state, drive = (start[:d], start[d:]), (driving[:-1], slopes, jnp.diff(t))
+    q, qd = driven(rate, state, *drive, substeps=substeps, method=looped_rk4)
+    return jnp.concatenate([q, qd], axis=1)
+
+
+def measured_problem(
+    model: Model,
+    parameters: Parameters,
+    windows: MeasuredWindows,
+    validation: MeasuredWindows,
+    *,
+    noise: Noise,
+    gauge: Gauge | None = None,
+    torque: Torque = "interpolated",
+    substeps: int = 1,
+    seed: int = 0,
+) -> Problem:
+    """Builds the problem of fitting a model's parameters to windows, in float64, with the starts eliminated.
+
+    The validation windows select the parameters, by the distance of simulated motions after fitting their starts too.
+
+    Args:
+        model: built from any energies, or from accelerations, with float64 parameters.
+        parameters: initial parameters, for example from `learning.matching.accelerations_problem`.
+        validation: windows that select the parameters.
+        noise: standard deviations of the measurements; noise alone then gives a loss of d (2 d if velocities were
+            measured), less what the starts absorb.
+        gauge: fixes the scale of the energies; needed only for motions without torques.
+        torque: torque between samples.
+        substeps: RK4 steps between two samples.
+
+    Raises:
+        InputError: no windows, noise that is not positive, neither torques nor a gauge, or a gauge of the wrong size.
+    """
+    require_positive(substeps=substeps)
+    d = windows.q.shape[2]
+    require_windows(windows, validation, noise_q=noise.q, noise_qd=noise.qd, noise_tau=noise.tau)
+    check_gauge(gauge, windows.tau, d)
+
+    def first(window: tuple[Array, ...]) -> Array:
+        _, q, qd, *_ = window
+        return jnp.concatenate([q[0], qd[0], *([] if noise.tau is None else [jnp.zeros(d)])])
+
+    def error(system: Dynamics | PlainDynamics, start: Array, window: tuple[Array, ...]) -> Array:
+        return _measured_residual(system, start, window, noise=noise, torque=torque, substeps=substeps)
+
+    def residual(parameters: Parameters, *window: Array) -> Array:
+        frozen = dynamics(model.energies(jax.lax.stop_gradient(parameters)))
+        system = dynamics(model.energies(parameters))
+        left = without_start(
+            lambda start: error(frozen, start, window), lambda start: error(system, start, window), first(window)
+        )
+        return jnp.append(left, gauge_error(system, gauge))
+
+    def closest(parameters: Parameters, *window: Array) -> Array:
+        system = dynamics(model.energies(parameters))
+        return error(system, nearest(lambda start: error(system, start, window), first(window)), window)
+
+    return selected_by(arrays_of(validation), residual, parameters, arrays_of(windows), seed, error=closest)
+
+
+def check_gauge(gauge: Gauge | None, tau: np.ndarray, d: int) -> None:
+    """Raises `InputError` if there are neither torques nor a gauge, or the gauge has a wrong size or a mass <= 0."""
+    if gauge is None:
+        if not np.any(tau):
+            raise InputError("motions without torques fit any multiple of an energy; give a gauge")
+        return
+    require_positive(gauge_mass=gauge.mass)
+    if len(gauge.q) != d:
+        raise InputError(f"the gauge has {len(gauge.q)} coordinates, the data {d}; make them agree")
+
+
+def gauge_error(system: Dynamics | PlainDynamics, gauge: Gauge | None) -> Float[Array, " n"]:
+    """Distance of the mass matrix from the gauge, in units of `GAUGE_TOLERANCE` [1]; empty without either."""
+    if gauge is None or not isinstance(system, Dynamics):
+        return jnp.zeros(0)
+    M = system.mass_matrix(jnp.asarray(gauge.q))
+    return jnp.reshape(jnp.mean(jnp.diagonal(M)) / gauge.mass - 1, 1) / GAUGE_TOLERANCE
+
+
+def _measured_residual(
+    system: Dynamics | PlainDynamics,
+    start: Array,
+    window: tuple[Array, ...],
+    *,
+    noise: Noise,
+    torque: Torque,
+    substeps: int,
+) -> Array:
+    t, q, qd, tau, weight = window
+    d = q.shape[1]
+    start, push = start[: 2 * d], start[2 * d :]
+    pushed = tau if noise.tau is None else tau + push
+    states = motion(system, start, t, pushed, torque=torque, substeps=substeps)
+    errors = [(states[:, :d] - q) / jnp.asarray(noise.q)]
+    if noise.qd is not None:
+        errors.append((states[:, d:] - qd) / jnp.asarray(noise.qd))
+    residual = weigh(weight, *errors)
+    return residual if noise.tau is None else jnp.concatenate([residual, push / jnp.asarray(noise.tau)])
