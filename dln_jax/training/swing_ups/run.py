@@ -31,7 +31,7 @@ from dln_jax.data import schema
 from dln_jax.figures.closed_loop_animations import cart_pole_drawing, rotary_pendulum_drawing, write_closed_loop_gif
 from dln_jax.figures.closed_loops import MOST_SHOWN, closed_loop_traces
 from dln_jax.files import write_figure, write_json
-from dln_jax.learning.recordings import STEPS
+from dln_jax.learning.weak_forms import STEPS
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.runs.progress import progress
 from dln_jax.sizes import require_memory
