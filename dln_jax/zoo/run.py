@@ -27,7 +27,6 @@ from dln_jax.zoo.parameter_files import MODEL, REMEDY, VALUE, load_manifest, loa
 from dln_jax.zoo.uncertainty_files import discard_uncertainty, load_uncertainty
 
 if TYPE_CHECKING:
-    from dln_jax.control.optimal.value_networks import ValueNetwork
     from dln_jax.zoo.value_functions import ValueRun
 
 Functions = TypeVar("Functions", bound=Dynamics | PlainDynamics | Flow | PlainFlow)
@@ -44,8 +43,8 @@ class Run:
     `mechanics.equations.dynamics(run.model.energies(parameters))`.
     """
 
-    model: "AnyModel | ValueNetwork"
-    """Pair of pure functions: of a mechanical system, of a function, of images, or of a value function."""
+    model: AnyModel
+    """Pair of pure functions: of a mechanical system, of a function, or of images."""
     parameters: Parameters
     """Parameters of the model."""
     description: Description
@@ -188,15 +187,10 @@ def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, tr
             catalogue is neither passed nor trusted; or the model needs double precision (the message names the line).
     """
     directory = Path(directory)
-    has_value = is_file(directory / f"{VALUE}.json")
-    if has_value:
-        from dln_jax.zoo.value_functions import load_value  # other runs do not need optimal control
-
-        if not is_file(directory / f"{MODEL}.json"):
-            value = load_value(directory)
-            wide = jax.tree.leaves(value.parameters)[0].dtype == jnp.float64
-            description = {"name": "value-function", "precision": "f64" if wide else "f32"}
-            return Run(value.network, value.parameters, description, value_function=value)
+    if not is_file(directory / f"{MODEL}.json") and (value := _value_in(directory)) is not None:
+        wide = jax.tree.leaves(value.parameters)[0].dtype == jnp.float64
+        description = {"name": "value-function", "precision": "f64" if wide else "f32"}
+        return Run(value.network, value.parameters, description, value_function=value)  # type: ignore[arg-type]
     description = read_description(directory)
     if description.get("precision") == "f64":
         require_double_precision(str(directory))
@@ -207,8 +201,16 @@ def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, tr
     like = jax.eval_shape(model.init, jax.random.key(0))
     parameters = load_tree(directory, MODEL, like)
     parameters = jax.tree.map(lambda leaf, as_built: leaf.astype(as_built.dtype), parameters, like)
-    value = load_value(directory, model, parameters) if has_value else None
-    return Run(model, parameters, description, load_uncertainty(directory), value)
+    return Run(model, parameters, description, load_uncertainty(directory), _value_in(directory, model, parameters))
+
+
+def _value_in(directory: Path, model: Any = None, parameters: Parameters = None) -> "ValueRun | None":
+    """The value function in a folder, if there is one, of a published plant or of the folder's model."""
+    if not is_file(directory / f"{VALUE}.json"):
+        return None
+    from dln_jax.zoo.value_functions import load_value  # other runs do not need optimal control
+
+    return load_value(directory, model, parameters)
 
 
 def read_description(directory: Path) -> Description:

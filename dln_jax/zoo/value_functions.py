@@ -19,7 +19,7 @@ from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
 from dln_jax.control.state_space import Law
 from dln_jax.files import as_type
 from dln_jax.mechanics import equations
-from dln_jax.models.model import Model, Parameters
+from dln_jax.models.model import Parameters
 from dln_jax.nn.activations import activation
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import REMEDY, VALUE, load_manifest, load_tree, save_tree
@@ -75,8 +75,8 @@ def plant_named(name: str, goal: Sequence[float] | None = None) -> ValuePlant:
     return plant._replace(problem=at_goal(plant.problem, [*goal, *np.zeros(d)]))
 
 
-def plant_of_model(model: Model, parameters: Parameters, problem: OwnProblem) -> ValuePlant:
-    """The plant of a learned or identified model of joints."""
+def plant_of_model(model: Any, parameters: Parameters, problem: OwnProblem) -> ValuePlant:
+    """The plant of a learned or identified `Model` of joints."""
     # Value iteration in float32 reads NumPy's float64 as float32, but not JAX's.
     energies = model.energies(jax.tree.map(np.asarray, parameters))
     return own_plant(equations.dynamics(energies, degrees_of_freedom=len(problem.joints)), problem)
@@ -106,7 +106,7 @@ def save_value(
     save_tree(folder, VALUE, parameters, facts)
 
 
-def load_value(folder: Path, model: Model | None = None, parameters: Parameters = None) -> ValueRun:
+def load_value(folder: Path, model: Any = None, parameters: Parameters = None) -> ValueRun:
     """The value function in a folder; a user's own plant needs the model that is stored with it.
 
     Raises:

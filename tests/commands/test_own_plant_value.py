@@ -80,10 +80,7 @@ def test_the_verdict_counts_the_starts_that_end_up():
         ("refused", {"down_up_share": np.nan}),
     ):
         assert verdict_of({**numbers, **changes}, 100).level == level, changes
-    assert (
-        "V differs from the cost of its law by 30.0%"
-        in verdict_of({**numbers, "value_error": 0.3}, 100).reason
-    )
+    assert "V differs from the cost of its law by 30.0%" in verdict_of({**numbers, "value_error": 0.3}, 100).reason
 
 
 def test_error_of_a_known_value_is_that_of_the_quadrature():

@@ -93,8 +93,7 @@ def problem_of(run: Run, known: Layout, positions: Any = None, **wishes: Any) ->
             raise InputError(f"--positions are {ranges.tolist()}; the goal or the posture of rest is outside")
         known = known._replace(limits=limits._replace(position=ranges))
     with jax.enable_x64(True):
-        energies = run.model.energies(jax.tree.map(np.asarray, run.parameters))
-        model = equations.dynamics(energies, degrees_of_freedom=len(known.joints))
+        model = equations.dynamics(run.energies, degrees_of_freedom=len(known.joints))
         return own_problem(model, known, **wishes)
 
 
@@ -109,7 +108,8 @@ def uncertain_numbers(
         field = rates(plant.problem)
         motors = plant.problem.actuation(jnp.asarray(plant.problem.goal, float)).shape[1]
         return ("strength of motors",) * motors, lambda p: lambda x, u: field(x, p * u)
-    model, parameters = run.model, jax.tree.map(np.asarray, run.parameters)
+    model: Any = run.model
+    parameters = jax.tree.map(np.asarray, run.parameters)
     B = np.asarray(problem.actuation)
     d, motors = B.shape
     masses = d if "tree" in run.description else 0

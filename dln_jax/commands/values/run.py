@@ -62,7 +62,7 @@ def train(options: Any) -> None:
     file = Path(options.plant)
     if options.run is None and file.suffix.lower() not in FILES and not file.is_file():
         refuse_given(options, OF_OWN, f"an option of one's own plant, and --plant is {options.plant!r:.40}")
-        name = OTHER_NAMES.get(options.plant, options.plant)
+        name = OTHER_NAMES.get(options.plant) or str(options.plant)
         plant = plant_named(name, goal)
         usual = OF_RESIDUAL if options.method == "residual" else FITS[name]
     else:

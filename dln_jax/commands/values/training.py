@@ -3,6 +3,7 @@
 import itertools
 import math
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -66,7 +67,8 @@ def by_iteration(
         if (stored := restore(checkpoint(seed), state[:3])) is None:
             return state
         tree, history = stored
-        return IterationState(*tree, [ValueProgress(at.step, at.loss, at.validation, at.seconds) for at in history])
+        done = [ValueProgress(at.step, at.loss, at.validation, at.seconds) for at in history]
+        return IterationState(*tree, history=done)
 
     def keep(seed: int, state: IterationState) -> None:
         history = [Progress(at.iteration, at.loss, at.validation, math.nan, at.seconds, "") for at in state.history]
@@ -130,7 +132,7 @@ def by_equation(
     return trained
 
 
-def evaluation(run: ValueRun, count: int, altered: dict[str, ValuePlant]) -> dict[str, float]:
+def evaluation(run: ValueRun, count: int, altered: Mapping[str, ValuePlant]) -> dict[str, float]:
     """Returns of a value function's law from both kinds of starts, and the error of V; a failed start counts as NaN.
 
     Args:
