@@ -23,7 +23,7 @@ LAYERS = {
     "data": 3,
     "scenes": 4,  # with the data generated from them
     "control": 5,
-    "zoo": 5,
+    "zoo": 5.5,
     "learning": 6,
     "metrics": 7,
     "export": 7,

@@ -13,15 +13,11 @@ it, the model is identified, and trials of the model choose all gains (law.json)
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
-from dln_jax.errors import InputError
 from dln_jax.options import Unstated, choice
+from dln_jax.runs.arguments import Unstated, choice
 from dln_jax.runs.options import Drawn, Folder
-
-FILES = (".xml", ".mjcf", ".urdf")
-"""Suffixes of robot files."""
 
 
 @dataclass(frozen=True)
@@ -54,31 +50,6 @@ class Arguments(Folder, Drawn):
 
 def main(options: Arguments) -> None:
     """Explores the plant, learns the model, swings up and writes the run folder; a refused law exits with status 1."""
-    from dln_jax.runs.stored_arguments import command_folder
-    from dln_jax.training.swing_ups import of_file, run
+    from dln_jax.commands.swing_ups.run import swing_up
 
-    file = Path(options.plant)
-    if not (file.suffix.lower() in FILES or file.is_file()):
-        if options.actuated is not None or options.control is not None:
-            raise InputError(f"--actuated and --control belong to a file; --plant is {options.plant!r:.40}")
-        model = options.model or "delan"
-        task = run.asked(
-            options.plant, model, options.seconds_of_data, options.starts, options.seed, options.estimator,
-            options.recover, options.push,
-        )  # fmt: skip
-        with command_folder(options, "swing_up") as folder:
-            run.swing_up(task, folder, figures=options.figures)
-            print(f"run folder: {folder}")
-        return
-    if options.model not in (None, "identified"):
-        raise InputError(f"--model is {options.model!r:.40}; the model of a file is identified")
-    actuated = options.actuated.split(",") if options.actuated else ()
-    of_plant = of_file.asked(
-        file, actuated, options.control, options.seconds_of_data, options.starts, options.seed,
-        options.estimator, options.recover, options.push,
-    )  # fmt: skip
-    with command_folder(options, "swing_up") as folder:
-        metrics = of_file.swing_up_file(of_plant, folder, figures=options.figures)
-        print(f"run folder: {folder}")
-    if metrics["success_share"] < of_file.LEAST_SHARE:
-        raise SystemExit(1)
+    swing_up(options)

@@ -2,7 +2,7 @@
 
 Trains by fitted value iteration, or on the residual of the Hamilton-Jacobi-Bellman equation, prints how long that took
 and what the law costs from 100 starts near hanging and 100 anywhere, and writes a run folder: value.safetensors and
-value.json (load them with dln_jax.training.values.load_value), metrics.json, config.json, and figures of V and of the
+value.json (dln_jax.load(folder).value), metrics.json, config.json, and figures of V and of the
 closed loop. --out FOLDER --resume continues an interrupted run.
 
 --plant also takes an MJCF or URDF file, and --run the folder of a learned or identified model. Costs, box and times
@@ -77,7 +77,9 @@ class Arguments(Scaled, Drawn, Resumable):
 
 def main(options: Arguments) -> None:
     """Trains and evaluates a value function, or evaluates a stored one, and writes the run folder."""
-    from dln_jax.training.pipeline import train
-    from dln_jax.training.value_training import VALUES
+    from dln_jax.commands.values import run
 
-    train(VALUES, options, "train_value")
+    if options.stored is None:
+        run.train(options)
+    else:
+        run.evaluate_stored(options)

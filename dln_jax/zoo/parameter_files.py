@@ -20,6 +20,8 @@ from dln_jax.types import InputError
 
 MODEL = "model"
 """Stem of the pair of files in a run folder that holds the trained model."""
+VALUE = "value"
+"""Stem of the pair of files in a run folder that holds a value function."""
 SCHEMA_VERSION = 2
 REMEDY = "restore the file or train again"
 

@@ -4,7 +4,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +23,11 @@ from dln_jax.types import InputError, VectorLike
 from dln_jax.zoo.descriptions import OWN, Description, build
 from dln_jax.zoo.differential_network import Derivatives, FunctionModel
 from dln_jax.zoo.images import ImageModel
-from dln_jax.zoo.parameter_files import MODEL, REMEDY, load_manifest, load_tree, require_fitting, save_tree
+from dln_jax.zoo.parameter_files import MODEL, REMEDY, VALUE, load_manifest, load_tree, require_fitting, save_tree
 from dln_jax.zoo.uncertainty_files import discard_uncertainty, load_uncertainty
+
+if TYPE_CHECKING:
+    from dln_jax.zoo.value_functions import ValueRun
 
 Functions = TypeVar("Functions", bound=Dynamics | PlainDynamics | Flow | PlainFlow)
 AnyModel = Model | FunctionModel | ImageModel
@@ -48,6 +51,8 @@ class Run:
     """Description to build the model from."""
     uncertainty: Uncertainty | None = None
     """Uncertainty of the model, if the run has one."""
+    value_function: "ValueRun | None" = None
+    """Value function in the folder, if it has one."""
 
     @functools.cached_property
     def energies(self) -> Any:
@@ -79,6 +84,13 @@ class Run:
         system = self._of("images", ImageModel).images(self.parameters)
         encode, decode = (_jitted(function, self.dtype) for function in (system.encode, system.decode))
         return LatentPhase(encode, decode, compiled(system.field, self.dtype))
+
+    @property
+    def value(self) -> "ValueRun":
+        """Value function with its plant and law. Raises InputError for a run without one."""
+        if self.value_function is None:
+            raise self._refusal("value")
+        return self.value_function
 
     @functools.cached_property
     def torque_std(self) -> Callable[[VectorLike, VectorLike, VectorLike], Array]:
@@ -122,6 +134,8 @@ class Run:
             offered = ".derivatives"
         elif isinstance(self.model, ImageModel):
             offered = ".images"
+        elif not isinstance(self.model, Model):
+            offered = ".value"
         else:
             plain = {PhaseRates: ".flow", InverseForward: ".dynamics"}
             offered = plain.get(type(self.energies), ".dynamics or .flow")
@@ -173,6 +187,10 @@ def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, tr
             catalogue is neither passed nor trusted; or the model needs double precision (the message names the line).
     """
     directory = Path(directory)
+    if not is_file(directory / f"{MODEL}.json") and (value := _value_in(directory)) is not None:
+        wide = jax.tree.leaves(value.parameters)[0].dtype == jnp.float64
+        description = {"name": "value-function", "precision": "f64" if wide else "f32"}
+        return Run(value.network, value.parameters, description, value_function=value)  # type: ignore[arg-type]
     description = read_description(directory)
     if description.get("precision") == "f64":
         require_double_precision(str(directory))
@@ -183,7 +201,16 @@ def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, tr
     like = jax.eval_shape(model.init, jax.random.key(0))
     parameters = load_tree(directory, MODEL, like)
     parameters = jax.tree.map(lambda leaf, as_built: leaf.astype(as_built.dtype), parameters, like)
-    return Run(model, parameters, description, load_uncertainty(directory))
+    return Run(model, parameters, description, load_uncertainty(directory), _value_in(directory, model, parameters))
+
+
+def _value_in(directory: Path, model: Any = None, parameters: Parameters = None) -> "ValueRun | None":
+    """The value function in a folder, if there is one, of a published plant or of the folder's model."""
+    if not is_file(directory / f"{VALUE}.json"):
+        return None
+    from dln_jax.zoo.value_functions import load_value  # other runs do not need optimal control
+
+    return load_value(directory, model, parameters)
 
 
 def read_description(directory: Path) -> Description:

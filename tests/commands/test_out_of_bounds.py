@@ -31,7 +31,8 @@ from dln_jax.commands import (
 from dln_jax.data import schema
 from dln_jax.runs.arguments import arguments_of
 from dln_jax.runs.stored_arguments import with_stored_arguments, write_config
-from dln_jax.training.values import Family, family_of, load_value, plant_named, save_value
+from dln_jax.zoo.run import load
+from dln_jax.zoo.value_functions import network_of, plant_named, save_value
 
 ROBOT = """<robot name="r"><link name="b"/><link name="l"><inertial><mass value="1"/>
 <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link><joint name="j" type="revolute">
@@ -120,16 +121,17 @@ VALUES = [
 
 
 def test_damaged_value_functions_are_refused(tmp_path):
-    plant, family = plant_named("pendulum"), Family((4,), 1)
-    save_value(tmp_path, "pendulum", None, family, family_of(plant, family).init(jax.random.key(0)))
+    settings = {"widths": [4], "members": 1, "activation": "tanh", "floor": 1e-3, "scale": 30.0}
+    network = network_of(plant_named("pendulum").problem, settings)
+    save_value(tmp_path, "pendulum", None, settings, network.init(jax.random.key(0)))
     path = tmp_path / "value.json"
     stored = json_of(path)
-    load_value(tmp_path)
+    load(tmp_path)
     networks = [{"network": {**stored["network"], name: "x"}} for name in stored["network"]]
     for change in [*map(json.loads, VALUES), *networks]:
         path.write_text(json.dumps({**stored, **change}))
         with one_line():
-            load_value(tmp_path)
+            load(tmp_path)
 
 
 # folders that have moved

@@ -8,16 +8,15 @@ from calls import assert_refused, command, exit_status, json_of, one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.commands import train_value
+from dln_jax.commands.values import plants, training
+from dln_jax.commands.values.training import verdict_of
 from dln_jax.control.optimal.action_costs import quadratic
 from dln_jax.control.optimal.fitted import Iteration
 from dln_jax.control.optimal.plants import Evaluation, Starts, ValuePlant, evaluate
 from dln_jax.control.optimal.problem import ControlProblem, rates
 from dln_jax.control.optimal.value_networks import value_network
-from dln_jax.training.value_checkpoints import Kept
-from dln_jax.training.value_plants import Wishes, of_file, of_run, with_factors
-from dln_jax.training.value_training import verdict_of
-from dln_jax.training.values import ValueRun, load_value, value_error
-from dln_jax.zoo.run import save
+from dln_jax.zoo.run import load, save
+from dln_jax.zoo.value_functions import ValueRun, plant_of_model
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the files; it is in the extra [robot]")
 ROD = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" damping="0.05"/>
@@ -46,17 +45,17 @@ def test_an_interrupted_run_resumes_to_the_same_bits_and_comes_back(tmp_path, ca
     command(train_value, *arguments, "--out", tmp_path / "whole")
     output = capsys.readouterr().out
     assert "hinge 2.5 N m" in output and "box, half widths: hinge 3.14 rad" in output and "verdict: " in output
-    store = Kept.store
+    store = training.store
 
     def stop(*state):
         store(*state)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(Kept, "store", stop)
+        patch.setattr(training, "store", stop)
         assert exit_status(train_value, *arguments, "--out", tmp_path / "cut") == 130
     command(train_value, "--out", tmp_path / "cut", "--resume")
-    whole, cut = (load_value(tmp_path / name) for name in ("whole", "cut"))
+    whole, cut = (load(tmp_path / name).value for name in ("whole", "cut"))
     x = jnp.array([1.0, -0.5])
     assert_array_equal(whole.law(x), cut.law(x))
     one, other = (json_of(tmp_path / name / "metrics.json")["heavy_weak_return_mean"] for name in ("whole", "cut"))
@@ -102,9 +101,9 @@ def test_error_of_a_known_value_is_that_of_the_quadrature():
     network = value_network(problem)._replace(value_and_gradient=value)
     runs = evaluate(plant, lambda x: -x / 2, np.linspace(0.3, 0.9, 4)[:, None])
     for scale in (1.0, 1.2):
-        error = value_error(ValueRun("integrator", plant, network, scale), runs)
+        error = training.value_error(ValueRun("integrator", plant, network, scale), runs)
         assert error == pytest.approx(scale - 1, abs=2e-3)
-    assert np.isnan(value_error(ValueRun("", plant, network, 1.0), runs._replace(settled=np.full(4, np.inf))))
+    assert np.isnan(training.value_error(ValueRun("", plant, network, 1.0), runs._replace(settled=np.full(4, np.inf))))
 
 
 def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys, rod):
@@ -125,16 +124,20 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys, rod):
 
 
 def test_the_model_in_a_folder_is_the_same_plant_as_its_file(tmp_path, rod):
-    known = of_file(rod, Wishes())
-    save(tmp_path, known.own.description, known.own.parameters)
-    stored = of_run(tmp_path, Wishes(control=2.5))
+    known, layout, _ = plants.of_file(rod)
+    save(tmp_path, known.description, known.parameters)
+    stored, stored_layout, _ = plants.of_run(tmp_path, control=2.5)
+    problem, other = plants.problem_of(known, layout), plants.problem_of(stored, stored_layout)
     for name in ("goal", "hanging", "scale", "weights", "box", "limits"):
-        assert_allclose(getattr(stored.own.problem, name), getattr(known.own.problem, name), atol=1e-5)
+        assert_allclose(getattr(other, name), getattr(problem, name), atol=1e-5)
     x, u = jnp.array([0.7, 1.0]), jnp.array([1.5])
-    accelerations = [rates(plant)(x, u) for plant in (stored.plant.problem, known.plant.problem)]
-    assert_allclose(*accelerations, rtol=1e-9)
+    plant = plant_of_model(known.model, known.parameters, problem)
+    from_folder = plant_of_model(stored.model, stored.parameters, other)
+    assert_allclose(*[rates(one.problem)(x, u) for one in (from_folder, plant)], rtol=1e-9)
     # A body of 1.2 times the mass is accelerated by the motor 1 / 1.2 as much.
-    heavy, light = (plant.actuation(x)[1, 0] for plant in (with_factors(known, [1.2, 1.0]), known.plant.problem))
-    assert float(heavy / light) == pytest.approx(1 / 1.2, rel=1e-9)
+    _, altered = plants.uncertain_numbers(plant, known, problem)
+    heavy = plants.with_factors(plant, altered, jnp.array([1.2, 1.0]))
+    ratio = heavy.problem.actuation(x)[1, 0] / plant.problem.actuation(x)[1, 0]
+    assert float(ratio) == pytest.approx(1 / 1.2, rel=1e-9)
     with one_line("states no limits of the motors"):
-        of_run(tmp_path, Wishes())
+        plants.of_run(tmp_path)

@@ -9,20 +9,20 @@ from calls import assert_refused, command, exit_status, json_of, refused
 
 from dln_jax import InputError, build, describe
 from dln_jax.commands import swing_up
+from dln_jax.commands.swing_ups.any_plant import Learned
 from dln_jax.control.plants.exploring import Exploration, Explored, recording_of
 from dln_jax.control.plants.runs import PlantRun, Trials
 from dln_jax.control.plants.tuning import Tuned
 from dln_jax.control.regulators import Regulator
 from dln_jax.data import schema
-from dln_jax.learning.recordings import FittedPlant
-from dln_jax.training.swing_ups.any_plant import Learned
+from dln_jax.learning.weak_forms import FittedPlant
 
 MOTOR = "--actuated elbow --control 5"
 
 
 def test_a_run_stores_data_numbers_and_pictures(tmp_path, monkeypatch):
     # A known model needs no exploration by the laws of learned ones, which take a minute to compile.
-    monkeypatch.setattr("dln_jax.training.swing_ups.learned.Exploration", partial(Exploration, surplus=()))
+    monkeypatch.setattr("dln_jax.commands.swing_ups.desktop.Exploration", partial(Exploration, surplus=()))
     few = "--plant furuta --model known --seconds-of-data 12 --starts 2 --estimator differences --out"
     command(swing_up, few, tmp_path / "run")
     found = json_of(tmp_path / "run/metrics.json")
@@ -64,7 +64,7 @@ def test_a_recording_that_a_later_step_refuses_is_kept(capsys, tmp_path, monkeyp
         keep(Explored(recording_of(runs, plant.layout), ()))
         raise InputError("the noise of q in the log is 0")
 
-    monkeypatch.setattr("dln_jax.training.swing_ups.of_file.learn_to_swing_up", learn)
+    monkeypatch.setattr("dln_jax.commands.swing_ups.run.learn_to_swing_up", learn)
     line = refused(capsys, swing_up, "--plant", two_links(tmp_path), MOTOR, "--out", tmp_path / "run")
     assert "the noise of q in the log is 0; the recording stays in" in line
     assert schema.load(tmp_path / "run/data.npz").q.shape == (20, 2)
@@ -75,15 +75,15 @@ def test_a_law_that_does_not_carry_over_to_the_plant_is_refused_with_the_reason(
         description = describe("planar-chain", precision="f64", needs=plant.layout.needs)
         fitted = FittedPlant(description, build(description).init(jax.random.key(0)))
         law = Tuned(None, "plan", {}, Regulator(np.zeros((1, 4)), np.zeros((4, 4))), 256, 1.0, 0.4, 1.4)
-        return Learned(None, None, fitted, law, None, 9.0)
+        return Learned(None, None, fitted, law, 9.0)
 
     few = Trials(np.array([np.inf, 1.0, np.inf]), ("'elbow' moves at 31/s",))
-    place = "dln_jax.training.swing_ups.of_file"
+    place = "dln_jax.commands.swing_ups.run"
     monkeypatch.setattr(f"{place}.learn_to_swing_up", learn)
     monkeypatch.setattr(f"{place}.try_plant", lambda *_, **__: (few, []))
     assert exit_status(swing_up, "--plant", two_links(tmp_path), MOTOR, "--starts 3 --out", tmp_path / "run") == 1
     said = capsys.readouterr().out
-    assert "33.3% of 3 starts up" in said and "refused: fewer than half" in said
+    assert "verdict: refused: 33.3% of 3 starts up" in said
     assert "1 of 3 were stopped; the first: 'elbow' moves at 31/s" in said
 
 

@@ -6,7 +6,7 @@ import pytest
 from calls import assert_refused, command, json_of
 
 from dln_jax.commands import train_value
-from dln_jax.training.values import load_value
+from dln_jax.zoo.run import load
 
 TINY = "--method residual --width 3 --depth 1 --iterations 1 --starts 3"
 
@@ -15,7 +15,7 @@ def test_a_run_is_stored_and_comes_back(tmp_path, capsys):
     command(train_value, TINY, "--goal 0.2 --out", tmp_path / "run")
     numbers = json_of(tmp_path / "run/metrics.json")
     assert numbers["validation"] > 0 and numbers["down_control_most"] <= 2.5
-    run = load_value(tmp_path / "run")
+    run = load(tmp_path / "run").value
     goal = jnp.array([0.2, 0.0])
     assert run.value_and_gradient(goal)[0] == 0 and np.isnan(run.law(goal * jnp.nan)).all()
     np.testing.assert_allclose(run.law(goal), -9.81 / 2 * np.sin(0.2), rtol=1e-9)

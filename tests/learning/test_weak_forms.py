@@ -45,7 +45,7 @@ def test_a_clean_motion_is_identified_without_accelerations():
     errors = np.asarray(torques(test.q, test.qd, test.qdd)) - test.tau
     assert np.mean(np.mean(errors**2, axis=0) / test.tau.var(axis=0)) < 1e-7
     assert np.asarray(fit.parameters.coulomb) == pytest.approx(DRY, rel=1e-3)
-    assert fit.equations > 3 * fit.parameter_count > 3 * fit.rank
+    assert fit.errors.size > 3 * fit.parameter_count > 3 * fit.rank
 
 
 def test_what_windows_cannot_take_is_one_line():

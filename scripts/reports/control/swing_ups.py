@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dln_jax.commands.swing_ups.desktop import errors_along, obtain, recorded, test_motions
 from dln_jax.control.closed_loop import (
     ClosedLoopRun,
     Controller,
@@ -39,7 +40,6 @@ from dln_jax.control.state_space import error, field_of, integrated, linearise, 
 from dln_jax.control.trajectories import Plan, TrajectoryProblem
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.pendulums import Links, two_link_pendulum
-from dln_jax.training.swing_ups.learned import errors_along, obtain, recorded, test_motions
 from dln_jax.types import InputError
 from scripts.reports.run import Numbers
 

@@ -10,17 +10,17 @@ from dln_jax.control.closed_loop import Hardware, Push
 from dln_jax.control.estimate.tuning import from_log
 from dln_jax.control.plants.estimators import estimator_of, require_estimator
 from dln_jax.control.plants.exploring import Exploration, Explored, explore
-from dln_jax.control.plants.plant import Layout, Plant
-from dln_jax.control.plants.runs import HELD, PlantRun, Trials, compiled, judged_runs, run, start_of
+from dln_jax.control.plants.plant import Plant
+from dln_jax.control.plants.runs import PlantRun, Trials, compiled, judged_runs, run, start_of
 from dln_jax.control.plants.tuning import Tuned, tune
 from dln_jax.data.encoders.sampling import held_at_equal_steps, noise_of
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified_chain, prepare
+from dln_jax.learning.weak_forms import FittedPlant, PreparedRecording, identified_chain, prepare
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import InputError, require_positive
 
 SECONDS = 10.0
-"""Duration of a run, s; longer for plants that need more than half of it to come up, see `run_seconds`."""
+"""Duration of a run, s."""
 CUTOFFS = (1.0, 2.0)
 """Multiples of the usual cut-off that are compared: fast motions of a short log may be too rare to raise it."""
 BAND = 10.0
@@ -34,8 +34,6 @@ class Learned(NamedTuple):
     prepared: PreparedRecording
     fitted: FittedPlant
     tuned: Tuned
-    hardware: Hardware
-    """As estimated from the recording: the delay, and the noise of measurements and motors."""
     seconds: float
     """Time for all steps, s."""
 
@@ -95,7 +93,7 @@ def learn_to_swing_up(
         f"tuned by {tuned.way}: {tuned.trials} trials, {tuned.worked:.1%} of the first sets worked; margin "
         f"{tuned.margin:.0%}, up in {tuned.seconds:.2f} s"
     )
-    return Learned(explored, prepared, fitted, tuned, hardware, time.perf_counter() - began)
+    return Learned(explored, prepared, fitted, tuned, time.perf_counter() - began)
 
 
 def model_of(recording: Trajectories) -> Dynamics:
@@ -105,18 +103,8 @@ def model_of(recording: Trajectories) -> Dynamics:
     return identified_chain(prepare(recording, chain=True), recording.needs).dynamics
 
 
-def run_seconds(tuned: Tuned) -> float:
-    """Duration of a run, s: long enough for a second attempt."""
-    return max(SECONDS, 2 * tuned.seconds + HELD)
-
-
-def push_at_half(layout: Layout, rate: float) -> Push | None:
-    """A push on the passive joints in the middle of a run, rad/s or m/s; `None` for zero."""
-    return Push(SECONDS / 2, np.where((layout.actuation != 0).any(axis=1), 0.0, rate)) if rate else None
-
-
 def try_plant(
-    make: Callable[[int], Plant],
+    make: Callable[..., Plant],
     tuned: Tuned,
     *,
     starts: int = 100,
@@ -133,7 +121,7 @@ def try_plant(
         push: push on every plant.
     """
     require_positive(starts=starts)
-    plants = [make(seed + number) for number in range(starts)]
+    plants = [make(seed=seed + number) for number in range(starts)]
     layout = plants[0].layout
     act = compiled(tuned.controller, layout)
     runs = run(plants, act, start_of(tuned.controller, starts), seconds=seconds, push=push)

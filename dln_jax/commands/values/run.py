@@ -1,0 +1,192 @@
+"""A run of train_value: reads its options, trains or loads a value function, evaluates it and finishes the folder."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.commands.values.figures import closed_loop, value_plane
+from dln_jax.commands.values.plants import of_file, of_run, problem_of, uncertain_numbers, with_factors
+from dln_jax.commands.values.training import by_equation, by_iteration, evaluation, verdict_of
+from dln_jax.control.optimal.fitted import Iteration
+from dln_jax.control.optimal.own_plants import described, own_settings
+from dln_jax.control.optimal.plants import FITS, ValuePlant, ValueSettings
+from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
+from dln_jax.files import finite
+from dln_jax.precision import with_float64
+from dln_jax.runs.arguments import names_listed, numbers_of, refuse_given, require_positive_if_given
+from dln_jax.runs.report import Report, finish, png
+from dln_jax.runs.scaled import mesh_of
+from dln_jax.runs.stored_arguments import command_folder
+from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.zoo.run import load, save
+from dln_jax.zoo.value_functions import (
+    OTHER_NAMES,
+    ValueRun,
+    network_of,
+    plant_named,
+    plant_of_model,
+    save_value,
+)
+
+FILES = (".xml", ".mjcf", ".urdf")
+"""Suffixes of robot files."""
+OF_OWN = ("actuated", "control", "positions", "effort", "weights", "box")
+"""Options of a user's own plant."""
+ITERATIONS = 15
+"""Gauss-Newton iterations per discount."""
+OF_RESIDUAL = ValueSettings((24, 24), Iteration(), 30.0)
+"""Networks for the residual of a published plant."""
+
+
+def train(options: Any) -> None:
+    """Trains once per seed, keeps the best by validation, and evaluates it.
+
+    Raises:
+        InputError: an option is wrong, or the plant; nothing is written then.
+        FitRefused: the law does not bring its starts up.
+    """
+    mesh = mesh_of(options)
+    require_positive(starts=options.starts, seeds=options.seeds)
+    require_seed(options.seed, options.seeds)
+    require_positive_if_given(options, ("width", "depth", "members", "iterations"))
+    if not 0 <= options.robust < 1:
+        raise InputError(
+            f"robust is {options.robust}; expected a share of masses and motors of at least 0 and less than 1"
+        )
+    goal = None if options.goal is None else numbers_of("--goal", options.goal)
+    model, problem, lines = None, None, []
+    file = Path(options.plant)
+    if options.run is None and file.suffix.lower() not in FILES and not file.is_file():
+        refuse_given(options, OF_OWN, f"an option of one's own plant, and --plant is {options.plant!r:.40}")
+        name = OTHER_NAMES.get(options.plant) or str(options.plant)
+        plant = plant_named(name, goal)
+        usual = OF_RESIDUAL if options.method == "residual" else FITS[name]
+    else:
+        name = str(options.run or file)
+        actuated, control = names_listed(options.actuated), positive_numbers(options, "control")
+        control = control[0] if control is not None and len(control) == 1 else control
+        source, read = (file, of_file) if options.run is None else (options.run, of_run)
+        model, known, lacking = read(source, actuated, control, goal)
+        problem = problem_of(
+            model,
+            known,
+            None if options.positions is None else ranges_of(options.positions),
+            effort=options.effort,
+            weights=positive_numbers(options, "weights"),
+            box=positive_numbers(options, "box"),
+        )
+        plant, usual = plant_of_model(model.model, model.parameters, problem), own_settings(problem)
+        lines = [*described(problem), *filter(None, [lacking])]
+        if options.method == "residual":
+            usual = OF_RESIDUAL._replace(scale=usual.scale)
+    names, altered = uncertain_numbers(plant, model, problem)
+    disturbance, extremes = None, {}
+    if options.robust:
+        bounds = Bounds(parameters=options.robust)
+        disturbance = worst_disturbance(lambda x, u, p: altered(p)(x, u), np.ones(len(names)), bounds)
+        for extreme, sign in (("heavy_weak", options.robust), ("light_strong", -options.robust)):
+            factors = jnp.array([1 - sign if of.startswith("strength") else 1 + sign for of in names], float)
+            extremes[extreme] = with_factors(plant, altered, factors)
+    widths = [options.width or usual.widths[0]] * (options.depth or len(usual.widths))
+    settings = {
+        "widths": widths,
+        "members": options.members or 1,
+        "activation": "tanh",
+        "floor": 1e-3,
+        "scale": usual.scale,
+    }
+    network, seeds = network_of(plant.problem, settings), range(options.seed, options.seed + options.seeds)
+    with command_folder(options, "train_value") as folder:
+        for line in lines:
+            print(line)
+        print(f"{name}: {options.method}, {settings['members']} x {len(widths)} layers of {widths[0]}")
+        if options.robust:
+            print(f"robust against errors of {options.robust:.0%} of {' and '.join(dict.fromkeys(names))}")
+        if options.method == "residual":
+            trained = by_equation(
+                plant.problem, network, options.iterations or ITERATIONS, seeds, mesh=mesh, disturbance=disturbance
+            )
+        else:
+            iteration = usual.numbers._replace(iterations=options.iterations or usual.numbers.iterations)
+            own = None if model is None or problem is None else [dataclasses.asdict(problem), model.description]
+            identity = [name if own is None else own, goal, settings, iteration._asdict(), options.robust]
+            trained = by_iteration(
+                plant.problem,
+                network,
+                iteration,
+                seeds,
+                folder=folder,
+                identity=identity,
+                resume=options.resume,
+                mesh=mesh,
+                disturbance=disturbance,
+            )
+        best = min(trained, key=lambda training: training.validation)
+        if model is not None:
+            save(folder, model.description, model.parameters)
+        save_value(folder, name, goal, settings, best.parameters, problem)
+        metrics = {"train_seconds": best.train_seconds, "validation": best.validation}
+        if len(trained) > 1:
+            validation = [training.validation for training in trained]
+            metrics |= {
+                "validation_median": float(np.median(validation)),
+                "validation_worst": float(np.max(validation)),
+                "train_seconds_median": float(np.median([training.train_seconds for training in trained])),
+            }
+        run = ValueRun(name, plant, network, with_float64(best.parameters), problem)
+        finish(folder, options, report_of(run, options, metrics, extremes))
+
+
+def evaluate_stored(options: Any) -> None:
+    """Evaluates a stored value function on its own plant; raises `InputError` as `load`."""
+    mesh_of(options)  # refuses devices that the machine lacks
+    require_positive(starts=options.starts)
+    run = load(options.stored).value
+    run = dataclasses.replace(run, parameters=with_float64(run.parameters))
+    with command_folder(options, "train_value") as folder:
+        report = report_of(run, options, {}, {})
+        # The evaluation of a stored value function reports the verdict; a training refuses.
+        lines = () if report.verdict is None else (report.verdict.line,)
+        finish(folder, options, report._replace(verdict=None, lines=lines))
+
+
+def report_of(run: ValueRun, options: Any, numbers: Mapping[str, float], extremes: Mapping[str, ValuePlant]) -> Report:
+    """Returns of the law in the evaluation, also on extreme plants, whether its starts end upright, and figures."""
+    measured = evaluation(run, options.starts, extremes)
+    verdict = verdict_of(measured, options.starts)
+    numbers = {**numbers, **measured}
+    return Report(
+        metrics={**finite(numbers), "verdict": verdict.number},
+        rows=[
+            (key.replace("_", " "), f"{value:.4g}", "s" if "seconds" in key else "") for key, value in numbers.items()
+        ],
+        title=f"returns from {options.starts} starts hanging, and anywhere",
+        verdict=verdict,
+        figures={"value.png": png(value_plane, run), "closed-loop.png": png(closed_loop, run)},
+        chosen={"plant": run.name},
+        ended_by_user=getattr(options, "iterations", None) is not None,
+    )
+
+
+def positive_numbers(options: Any, name: str) -> tuple[float, ...] | None:
+    """Positive numbers of an option, if it was set."""
+    text = getattr(options, name)
+    return None if text is None else numbers_of(f"--{name}", text, positive=True)
+
+
+def ranges_of(text: str) -> list[tuple[float, float]]:
+    """Parses the ranges of --positions, such as -0.5:0.5,free."""
+    ranges = []
+    for part in text.split(","):
+        low, _, high = part.strip().replace("free", "-inf:inf").partition(":")
+        try:
+            ranges.append((float(low), float(high)))
+        except ValueError:
+            ranges.append((np.nan, np.nan))
+        if not ranges[-1][0] < ranges[-1][1]:
+            raise InputError(f"--positions has {part!r:.40}; expected LOW:HIGH or free for every joint: -1:1,free")
+    return ranges

@@ -1,1 +1,0 @@
-"""Swing-up of a plant: exploration, learning, control and animation."""
