@@ -28,6 +28,8 @@ Together = Callable[[], contextlib.AbstractContextManager[Any]]
 """Context of all submissions."""
 MINUTES, TIMEOUTS = 60, 20
 """Time limit of a Slurm job in minutes, and how often submitit requeues a job that reaches it."""
+MOST_IN_ARRAY = 1000
+"""Largest number of jobs in an array, Slurm's default MaxArraySize."""
 
 
 def run(
@@ -55,23 +57,20 @@ def run(
             if not ended:
                 time.sleep(SECONDS_BETWEEN_LOOKS)
             waiting = [pair for pair in waiting if pair not in ended]
-            bad += sum(_final_state(job, future) != "done" for job, future in ended)
+            for job, future in ended:
+                status = status_of(job.folder)
+                if status.state in ("missing", "running"):  # the job has not stored its end
+                    word = getattr(future, "state", "")  # Slurm's state, such as OUT_OF_MEMORY
+                    how = "did not start" if status.state == "missing" else "ended without a word"
+                    line = f"{how} ({word})" if isinstance(word, str) and word else how
+                    status = status._replace(state="killed", line=line)
+                    write_json(job.folder / STATUS, status._asdict())
+                bad += status.state != "done"
             report(len(jobs) - len(waiting), bad)
     except BaseException:
         for _, future in waiting:
             future.cancel()
         raise
-
-
-def _final_state(job: Job, future: Any) -> str:
-    """State of a job whose future is done; a job that has not stored its end is recorded as killed."""
-    status = status_of(job.folder)
-    if status.state in ("missing", "running"):
-        word = getattr(future, "state", "")  # Slurm's state, such as OUT_OF_MEMORY
-        how = "did not start" if status.state == "missing" else "ended without a word"
-        status = status._replace(state="killed", line=f"{how} ({word})" if isinstance(word, str) and word else how)
-        write_json(job.folder / STATUS, status._asdict())
-    return status.state
 
 
 @contextlib.contextmanager
@@ -110,13 +109,14 @@ def here(at_once: int, gpus: int) -> Iterator[tuple[Submit, Together]]:
 
 
 @contextlib.contextmanager
-def slurm(folder: Path, at_once: int | None, options: str) -> Iterator[tuple[Submit, Together]]:
+def slurm(folder: Path, at_once: int | None, options: str, jobs: int) -> Iterator[tuple[Submit, Together]]:
     """Runs jobs as one array of a Slurm cluster, by submitit.
 
     Args:
         folder: folder of the sweep, which all hosts must see.
         at_once: jobs of the array that run at once; None: as many as Slurm allows.
         options: options of sbatch under submitit's names: "partition=gpu time=60 gpus_per_node=1".
+        jobs: number of jobs.
 
     Raises:
         InputError: Slurm is not installed here or refuses the array, or submitit does not know an option.
@@ -124,10 +124,18 @@ def slurm(folder: Path, at_once: int | None, options: str) -> Iterator[tuple[Sub
     submitit = required("submitit", "sweep")
     if missing := [name for name in ("sbatch", "srun", "sacct", "scancel") if shutil.which(name) is None]:
         raise InputError(f"--where slurm: no {missing[0]} on the PATH; call it on a host of the cluster")
+    if jobs > MOST_IN_ARRAY:
+        raise InputError(f"{jobs} jobs for one Slurm array; expected at most {MOST_IN_ARRAY}; split the grid")
+    parameters: dict[str, Any] = {"job_name": folder.name, "time": MINUTES}
+    parameters |= {} if at_once is None else {"array_parallelism": at_once}
+    for name, value in pairs("--slurm", options).items():
+        number = value.isdecimal() and len(value) < 10
+        if name == "time" and not number:
+            raise InputError(f"--slurm: time is {value!r:.40}; expected whole minutes")
+        parameters[name] = int(value) if number else [value] if name in ("setup", "teardown") else value
     executor = submitit.SlurmExecutor(folder=folder / "submitit", max_num_timeout=TIMEOUTS)
     try:
-        limit = {} if at_once is None else {"array_parallelism": at_once}
-        executor.update_parameters(**{"job_name": folder.name, "time": MINUTES, **limit, **sbatch_options(options)})
+        executor.update_parameters(**parameters)
     except (NameError, TypeError, ValueError, AssertionError) as error:
         raise InputError(f"--slurm: {' '.join(str(error).split())[:300]}") from None
 
@@ -178,17 +186,6 @@ def ray(at_once: int, gpus: int) -> Iterator[tuple[Submit, Together]]:
         yield lambda function, job: task(function).remote(job).future(), contextlib.nullcontext
     finally:
         package.shutdown()
-
-
-def sbatch_options(text: str) -> dict[str, Any]:
-    """Parses --slurm into submitit's parameters; `InputError` if the time is not in whole minutes."""
-    options: dict[str, Any] = {}
-    for name, value in pairs("--slurm", text).items():
-        number = value.isdecimal() and len(value) < 10
-        if name == "time" and not number:
-            raise InputError(f"--slurm: time is {value!r:.40}; expected whole minutes")
-        options[name] = int(value) if number else [value] if name in ("setup", "teardown") else value
-    return options
 
 
 def cores() -> int:

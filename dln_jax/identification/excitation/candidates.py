@@ -3,7 +3,6 @@
 A motion is checked at ten times as many samples as it is designed at, and keeps a margin for the times between.
 """
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -65,7 +64,7 @@ def furthest(task: Task, motion: FourierMotion) -> tuple[float, str]:
     return max(worst(task.samples(*part)[2]) for part in parts)
 
 
-def kept(task: Task, motion: FourierMotion) -> tuple[Design | None, str]:
+def shrink_to_limits(task: Task, motion: FourierMotion) -> tuple[Design | None, str]:
     """Shrinks a motion towards its mean posture until it keeps the limits; `None` if even the smallest breaks them.
 
     The second result is the limit broken at the smallest amplitude, as text.
@@ -76,7 +75,7 @@ def kept(task: Task, motion: FourierMotion) -> tuple[Design | None, str]:
 
     beyond, _ = furthest(task, motion)
     if beyond <= -MARGIN:
-        return measured(task, motion), ""
+        return assess(task, motion), ""
     beyond, kind = furthest(task, shrunk(SMALLEST))
     if beyond > -MARGIN:
         return None, f"{kind} by {100 * beyond:.2g} %" if kind != "clearance" else f"clearance by {beyond:.2g} m"
@@ -87,7 +86,7 @@ def kept(task: Task, motion: FourierMotion) -> tuple[Design | None, str]:
             amplitude = middle
         else:
             broken = middle
-    return measured(task, shrunk(amplitude)), ""
+    return assess(task, shrunk(amplitude)), ""
 
 
 def weighted(task: Task, Phi: Any) -> Any:
@@ -95,7 +94,7 @@ def weighted(task: Task, Phi: Any) -> Any:
     return Phi[..., task.columns] / task.noise[:, None]
 
 
-def measured(task: Task, motion: FourierMotion) -> Design:
+def assess(task: Task, motion: FourierMotion) -> Design:
     """Computes information, condition and slack of a motion."""
     at = states(functions_at(task, grid(task)), motion.offset, motion.coefficients)
     W = weighted(task, np.asarray(task.samples(*at)[0])).reshape(-1, task.columns.size)
@@ -116,25 +115,13 @@ def random_designs(task: Task, count: int, *, seed: int = 0) -> list[Design]:
     """
     require_positive(count=count)
     require_seed(seed)
-    drawn, designs, failed = _draws(task, np.random.default_rng(seed)), [], 0
-    while len(designs) < count:
-        design, broken = kept(task, next(drawn))
-        if design is not None:
-            designs.append(design)
-        elif (failed := failed + 1) >= DRAWS * max(1, len(designs)):
-            raise InputError(
-                f"{failed} random motions broke the limits even when small, the last of {broken}; widen it"
-            )
-    return designs
-
-
-def _draws(task: Task, random: np.random.Generator) -> Iterator[FourierMotion]:
-    limits, basis = task.limits, rest_basis(task.harmonics)
+    random, limits, basis = np.random.default_rng(seed), task.limits, rest_basis(task.harmonics)
     functions = functions_at(task, grid(task, FINER))
     lower, upper = limits.position.T
     # Dividing by the order gives all harmonics the same velocity.
     spectrum = 1 / np.tile(np.arange(1, task.harmonics + 1), 2)
-    while True:
+    designs, failed = [], 0
+    while len(designs) < count:
         coefficients = random.normal(size=(len(lower), 2 * task.harmonics)) * spectrum @ basis @ basis.T
         q, qd, qdd = (values @ coefficients.T for values in functions)
         sizes = [np.ptp(q, axis=0) / (upper - lower)]
@@ -142,4 +129,12 @@ def _draws(task: Task, random: np.random.Generator) -> Iterator[FourierMotion]:
         scale = (1 - 2 * MARGIN) / np.max(sizes, axis=0)
         free = (upper - lower) - scale * np.ptp(q, axis=0)
         offset = lower - scale * q.min(axis=0) + free * random.uniform(0.1, 0.9, len(lower))
-        yield FourierMotion(offset, scale[:, None] * coefficients, task.period)
+        motion = FourierMotion(offset, scale[:, None] * coefficients, task.period)
+        design, broken = shrink_to_limits(task, motion)
+        if design is not None:
+            designs.append(design)
+        elif (failed := failed + 1) >= DRAWS * max(1, len(designs)):
+            raise InputError(
+                f"{failed} random motions broke the limits even when small, the last of {broken}; widen it"
+            )
+    return designs

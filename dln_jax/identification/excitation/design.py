@@ -25,11 +25,11 @@ from dln_jax.identification.excitation.candidates import (
     functions_at,
     furthest,
     grid,
-    kept,
+    shrink_to_limits,
     states,
     weighted,
 )
-from dln_jax.identification.excitation.fourier import FourierMotion, require_sampling, rest_basis, sampled
+from dln_jax.identification.excitation.fourier import FourierMotion, require_sampling, rest_basis, sample
 from dln_jax.identification.excitation.task import Task
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
@@ -43,8 +43,8 @@ FIRST_MARGIN, TIGHTENINGS = 0.01, 3
 larger margin after each that exceeds the limits."""
 Criterion = Callable[[Array], Array]
 """A [B, B] -> scalar to minimise."""
-Optimiser = Callable[[Design, Any], Design | None]
-"""(start, information already available [B, B]) -> design within the limits, or `None` if there is none."""
+Designer = Callable[..., Design]
+"""(starts, information already available [B, B] or `None`) -> the best design within the limits."""
 
 
 def _scaled(A: Float[Array, "B B"]) -> tuple[Float[Array, "B B"], Float[Array, " B"]]:
@@ -69,8 +69,8 @@ def condition(A: Float[Array, "B B"]) -> Scalar:
 CRITERIA: dict[str, Criterion] = {"information": information, "condition": condition}
 
 
-def make_optimiser(task: Task, criterion: Criterion, *, rounds: int = 8, iterations: int = 60) -> Optimiser:
-    """Makes an optimiser that is compiled once for all starts.
+def make_designer(task: Task, criterion: Criterion, *, rounds: int = 8, iterations: int = 60) -> Designer:
+    """Makes a function that optimises starts and returns the best design, the starts included; it compiles once.
 
     Args:
         criterion: function of the information, such as one of `CRITERIA`.
@@ -94,11 +94,10 @@ def make_optimiser(task: Task, criterion: Criterion, *, rounds: int = 8, iterati
 
     minimise = make_minimiser(problem, rounds=rounds, iterations=iterations)
 
-    def optimise(start: Design, known: Any = None) -> Design | None:
+    def optimised(start: Design, known: np.ndarray) -> Design | None:
         motion, margin = start.motion, FIRST_MARGIN
         posture = (np.asarray(motion.offset) - middle) / half
         x = np.column_stack([posture, np.asarray(motion.coefficients) / half[:, None] @ basis]).ravel()
-        known = np.zeros_like(start.information) if known is None else np.asarray(known)
         for _ in range(TIGHTENINGS):
             x = minimise(x, known, margin).x
             offset, coefficients = series(x)
@@ -107,34 +106,21 @@ def make_optimiser(task: Task, criterion: Criterion, *, rounds: int = 8, iterati
             if beyond <= -MARGIN:
                 break
             margin += beyond + 2 * MARGIN
-        return kept(task, motion)[0]
+        return shrink_to_limits(task, motion)[0]
 
-    return optimise
+    def best(starts: Sequence[Design], known: Any = None) -> Design:
+        if not starts:
+            raise InputError("there are no starts; expected at least one design")
+        known = np.zeros_like(starts[0].information) if known is None else np.asarray(known)
 
+        def worth(design: Design) -> float:
+            value = float(criterion(jnp.asarray(known + design.information)))
+            return value if np.isfinite(value) else np.inf
 
-def best_design(
-    task: Task, optimise: Optimiser, criterion: Criterion, starts: Sequence[Design], *, known: Any = None
-) -> Design:
-    """The best design among the optimised starts and the starts themselves.
+        designs = [design for start in starts if (design := optimised(start, known)) is not None]
+        return min([*designs, *starts], key=worth)
 
-    Args:
-        optimise: from `make_optimiser`, for the same task and criterion.
-        starts: such as `random_designs`.
-        known: information already available from other motions [B, B].
-
-    Raises:
-        InputError: no starts.
-    """
-    if not starts:
-        raise InputError("there are no starts; expected at least one design")
-    optimised = [design for start in starts if (design := optimise(start, known)) is not None]
-
-    def worth(design: Design) -> float:
-        A = design.information if known is None else known + design.information
-        value = float(criterion(jnp.asarray(A)))
-        return value if np.isfinite(value) else np.inf
-
-    return min([*optimised, *starts], key=worth)
+    return best
 
 
 def design_set(
@@ -161,13 +147,12 @@ def design_set(
     starts = len(drawn) // (trajectories + 1)
     if not starts:
         raise InputError(f"{len(drawn)} starts are fewer than the {trajectories + 1} motions; expected one for each")
-    judge = CRITERIA[criterion]
-    optimise = make_optimiser(task, judge)
+    best = make_designer(task, CRITERIA[criterion])
     designs: list[Design] = []
     for place in range(trajectories + 1):
         own = drawn[place * starts : (place + 1) * starts]
         known = sum(design.information for design in designs) if 0 < place < trajectories else None
-        designs.append(best_design(task, optimise, judge, own, known=known))
+        designs.append(best(own, known))
         say(place + 1, f"condition {designs[-1].condition:.3g}")
     return designs[:-1], designs[-1]
 
@@ -200,11 +185,10 @@ def as_trajectories(
         InputError: the rate is too low for the harmonics.
     """
     motions = [design.motion for design in designs]
-    for motion in motions:
-        require_sampling(period=motion.period, harmonics=motion.harmonics, rate=rate)
     period = motions[0].period
+    require_sampling(period=period, harmonics=motions[0].harmonics, rate=rate)
     t = np.linspace(0.0, period, round(period * rate) + 1)
-    q, qd, qdd = map(np.concatenate, zip(*(sampled(motion, t) for motion in motions), strict=True))
+    q, qd, qdd = map(np.concatenate, zip(*(sample(motion, t) for motion in motions), strict=True))
     force = jax.jit(jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics))
     index = np.repeat(np.arange(len(motions)), len(t))
     states = {"q": q, "qd": qd, "qdd": qdd, "tau": np.asarray(force(q, qd, qdd))}
