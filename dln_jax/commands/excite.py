@@ -71,8 +71,13 @@ def main(options: Arguments) -> None:
     from dln_jax.data.robots import read_robot
     from dln_jax.figures.joints import excitation_figure
     from dln_jax.files import write_figure, write_json
-    from dln_jax.identification.excitation.candidates import random_designs
-    from dln_jax.identification.excitation.design import as_trajectories, design_set, error_ratio, together
+    from dln_jax.identification.excitation.design import (
+        as_trajectories,
+        design_set,
+        error_ratio,
+        random_designs,
+        together,
+    )
     from dln_jax.identification.excitation.fourier import require_sampling
     from dln_jax.identification.excitation.limits import heights_above, limits_of_robot, scale_limits
     from dln_jax.identification.excitation.task import make_task

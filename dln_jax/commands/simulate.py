@@ -121,7 +121,7 @@ def main(options: Arguments) -> None:
                 rows=table,
                 title="",
                 lines=tuple(warnings(motion)),
-                figures=figures_of(name, example, motion, title),
+                figures=figures_of(name, example, motion, pictures[-1], title),
                 chosen={"dt": dt, "seconds": prepared.steps * dt},
             )
             finish(own, dataclasses.replace(options, scene=name), report)

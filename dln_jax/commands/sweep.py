@@ -97,9 +97,9 @@ def main(options: Arguments) -> None:
                 executor = (ray if where == "ray" else here)(at_once or 1, options.gpus or 0)
             done = f", {len(jobs) - len(left)} are done" if len(left) < len(jobs) else ""
             share = "an array of the cluster" if at_once is None else f"{at_once} at once"
-            with executor as (submit, together), progress(len(left), "jobs") as show:
+            with executor as submit, progress(len(left), "jobs") as show:
                 print(f"{command}: {len(left)} of {len(jobs)} jobs{done}; {where}, {share}", flush=True)
-                run(left, submit, together, lambda ended, bad: show(ended, f"{bad} not done" if bad else ""))
+                run(left, submit, lambda ended, bad: show(ended, f"{bad} not done" if bad else ""))
         results = compare(jobs, over, metric=options.metric, error=options.error, largest=options.best == "largest")
         write_tables(folder, {"command": command, "where": where, "at_once": at_once, **results})
         if figure := sweep_figure(results, at_once):

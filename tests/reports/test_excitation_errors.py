@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from dln_jax.identification.excitation.candidates import assess, random_designs
+from dln_jax.identification.excitation.design import assess, random_designs
 from dln_jax.identification.excitation.limits import MotionLimits
 from dln_jax.identification.excitation.task import make_task
 from dln_jax.mechanics.trees.description import dh_frames, serial

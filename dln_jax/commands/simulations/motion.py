@@ -19,6 +19,7 @@ from dln_jax.metrics.report import Row
 from dln_jax.metrics.soft_body_energies import motion_energies
 from dln_jax.rollout import rollout
 from dln_jax.runs.progress import progress
+from dln_jax.runs.report import png
 from dln_jax.softbody.driven import Example, drive
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.simplices import volume_ratios
@@ -163,38 +164,36 @@ def moments_of(scene: str, example: Example, motion: SimulatedMotion) -> Moments
     return Moments(TITLES[scene], example.scene.mesh, motion.x[chosen], t[chosen], example.ground, stacked=stacked)
 
 
-def figures_of(scene: str, example: Example, motion: SimulatedMotion, title: str) -> dict[str, Callable[[Path], None]]:
+def figures_of(
+    scene: str, example: Example, motion: SimulatedMotion, picture: Moments, title: str
+) -> dict[str, Callable[[Path], None]]:
     """Functions that draw the energies, the moments and the GIF, up to the first moment that is not finite."""
-    shown = motion.finite
-    t, x, v = motion.t[:shown], motion.x[:shown], motion.v[:shown]
-    driven = drive(example, float(t[1]), max(shown - 1, 1))
-    # The start is shown with the actuation of the first step.
-    control = None if driven.control is None else jnp.concatenate([driven.control[:1], driven.control])[:shown]
+    shown = slice(motion.finite)
+    t, x, v, params = motion.t[shown], motion.x[shown], motion.v[shown], example.scene.params
+    control = drive(example, float(t[1]), max(len(t) - 1, 1)).control
+    if control is not None:
+        # The start is shown with the actuation of the first step.
+        control = jnp.concatenate([control[:1], control])[shown]
 
     def energies(path: Path) -> None:
-        params, taken = example.scene.params, None  # energy is fed in
-        if example.control is None and example.held_path is None:
-            rubs = any(getattr(term, "friction", None) is not None for term in params.terms.values())
-            taken = "taken by friction\nand by the time step" if rubs else "taken by the time step"
+        rubs = any(getattr(term, "friction", None) is not None for term in params.terms.values())
+        taken = "taken by friction\nand by the time step" if rubs else "taken by the time step"
+        if example.control is not None or example.held_path is not None:
+            taken = None  # energy is fed in
         found = motion_energies(example.scene, params, jnp.asarray(x), jnp.asarray(v), control)
         write_figure(path, energies_against_time(t, found, taken=taken, title=title))
 
-    def film(path: Path) -> None:
-        write_soft_body_gif(
-            path,
-            example.scene.mesh,
-            x,
-            t,
-            muscles=example.muscles,
-            actuation=None if control is None else np.asarray(control),
-            ground=None if example.ground is None else 0.0,
-            slope=example.ground or 0.0,
-            title=scene,
-            stride=motion.stride,
-            frames_per_second=max(1 / (motion.stride * float(t[1])), 1.0),
-        )
-
-    def moments(path: Path) -> None:
-        write_figure(path, moments_figure([moments_of(scene, example, motion)], columns=1))
-
-    return {"energy.png": energies, "moments.png": moments, "motion.gif": film}
+    film = functools.partial(
+        write_soft_body_gif,
+        mesh=example.scene.mesh,
+        positions=x,
+        t=t,
+        muscles=example.muscles,
+        actuation=None if control is None else np.asarray(control),
+        ground=None if example.ground is None else 0.0,
+        slope=example.ground or 0.0,
+        title=scene,
+        stride=motion.stride,
+        frames_per_second=max(1 / (motion.stride * float(t[1])), 1.0),
+    )
+    return {"energy.png": energies, "moments.png": png(moments_figure, [picture], columns=1), "motion.gif": film}

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dln_jax.commands.simulate import Arguments
 from dln_jax.data import meshes
 from dln_jax.precision import data_type
 from dln_jax.runs.arguments import names_listed, numbers_of, pairs_of, refuse_given
@@ -49,7 +50,7 @@ class PreparedScene(NamedTuple):
     """Notes on what the reader of the mesh left out or repaired."""
 
 
-def prepare(options: Any, name: str) -> PreparedScene:
+def prepare(options: Arguments, name: str) -> PreparedScene:
     """Builds a scene and its stepper with the options set on the command line.
 
     Raises:
@@ -99,7 +100,7 @@ def prepare(options: Any, name: str) -> PreparedScene:
     return PreparedScene(name, example, stepper, dt, steps, statements)
 
 
-def announce(prepared: PreparedScene, options: Any) -> None:
+def announce(prepared: PreparedScene, options: Arguments) -> None:
     """Prints size and settings of a scene, and what is suspicious about its mesh."""
     mesh = prepared.example.scene.mesh
     pieces, size = int(components(mesh).max()) + 1, np.ptp(mesh.vertices, axis=0)
@@ -141,7 +142,7 @@ def in_precision(tree: Any, precision: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf.astype(precision) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tree)
 
 
-def own_mesh(options: Any, youngs_modulus: float) -> tuple[dict[str, Any], tuple[str, ...]]:
+def own_mesh(options: Arguments, youngs_modulus: float) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Returns the arguments of a scene that --mesh and its options set, and statements about the file.
 
     Args:

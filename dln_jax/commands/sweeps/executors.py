@@ -1,7 +1,4 @@
-"""Runs the jobs of a sweep by any executor with futures.
-
-The executors here are contexts that yield the arguments `submit` and `together` of `run`.
-"""
+"""Runs the jobs of a sweep by any executor with futures; the contexts here yield the argument `submit` of `run`."""
 
 import contextlib
 import importlib
@@ -22,10 +19,8 @@ from dln_jax.commands.sweeps.job import SECONDS_BETWEEN_LOOKS, STATUS, Job, run_
 from dln_jax.files import write_json
 from dln_jax.types import InputError
 
-Submit = Callable[[Callable[..., None], Job], Any]
-"""(function, job) -> future with `done()` and `cancel()`, such as `concurrent.futures.ProcessPoolExecutor().submit`."""
-Together = Callable[[], contextlib.AbstractContextManager[Any]]
-"""Context of all submissions."""
+Submit = Callable[[Callable[..., None], Sequence[Job]], Sequence[Any]]
+"""(function, jobs) -> a future for each job, with `done()` and `cancel()`, such as `dask.distributed.Client().map`."""
 MINUTES, TIMEOUTS = 60, 20
 """Time limit of a Slurm job in minutes, and how often submitit requeues a job that reaches it."""
 MOST_IN_ARRAY = 1000
@@ -35,22 +30,19 @@ MOST_IN_ARRAY = 1000
 def run(
     jobs: Sequence[Job],
     submit: Submit,
-    together: Together = contextlib.nullcontext,
     report: Callable[[int, int], None] = lambda ended, bad: None,
 ) -> None:
     """Runs jobs until all have ended; records jobs that ended without a status as killed.
 
     Args:
         jobs: the jobs; the executor's processes must see their folders.
-        together: context of the submissions, for executors that start all jobs at once.
+        submit: starts a function of a job for all jobs.
         report: called with the number of jobs that have ended, and how many of these are not done.
     """
     for job in jobs:
         job.folder.mkdir(parents=True, exist_ok=True)
         write_json(job.folder / STATUS, status_of(job.folder)._replace(state="missing", line="")._asdict())
-    with together():
-        waiting = [(job, submit(run_job, job)) for job in jobs]
-    bad = 0
+    waiting, bad = list(zip(jobs, submit(run_job, jobs), strict=True)), 0
     try:
         while waiting:
             ended = [(job, future) for job, future in waiting if future.done()]
@@ -74,7 +66,7 @@ def run(
 
 
 @contextlib.contextmanager
-def here(at_once: int, gpus: int) -> Iterator[tuple[Submit, Together]]:
+def here(at_once: int, gpus: int) -> Iterator[Submit]:
     """Runs jobs as processes of this machine; leaving the context interrupts the ones that still run.
 
     A process gets its share of the cores as XLA threads, one BLAS thread, and one GPU or none, of those that the user's
@@ -102,14 +94,14 @@ def here(at_once: int, gpus: int) -> Iterator[tuple[Submit, Together]]:
 
     pool = ThreadPoolExecutor(at_once)
     try:
-        yield lambda function, job: pool.submit(work, function, job), contextlib.nullcontext
+        yield lambda function, jobs: [pool.submit(work, function, job) for job in jobs]
     finally:
         interrupt.set()
         pool.shutdown(cancel_futures=True)
 
 
 @contextlib.contextmanager
-def slurm(folder: Path, at_once: int | None, options: str, jobs: int) -> Iterator[tuple[Submit, Together]]:
+def slurm(folder: Path, at_once: int | None, options: str, jobs: int) -> Iterator[Submit]:
     """Runs jobs as one array of a Slurm cluster, by submitit.
 
     Args:
@@ -139,16 +131,15 @@ def slurm(folder: Path, at_once: int | None, options: str, jobs: int) -> Iterato
     except (NameError, TypeError, ValueError, AssertionError) as error:
         raise InputError(f"--slurm: {' '.join(str(error).split())[:300]}") from None
 
-    @contextlib.contextmanager
-    def array() -> Iterator[None]:
+    def submit(function: Callable[..., None], jobs: Sequence[Job]) -> Sequence[Any]:
         try:
-            with contextlib.redirect_stderr(io.StringIO()), executor.batch():  # submitit prints what it raises
-                yield
+            with contextlib.redirect_stderr(io.StringIO()):  # submitit prints what it raises
+                return executor.map_array(Requeued(function), jobs)
         except submitit.core.utils.FailedJobError as error:
             raise InputError(f"--where slurm: {' '.join(str(error).split())[-300:]}") from None
 
     try:
-        yield lambda function, job: executor.submit(Requeued(function), job), array
+        yield submit
     finally:
         # submitit exchanges jobs and results as pickles; nothing reads them again.
         for pickle in (folder / "submitit").glob("*.pkl"):
@@ -172,7 +163,7 @@ class Requeued(NamedTuple):
 
 
 @contextlib.contextmanager
-def ray(at_once: int, gpus: int) -> Iterator[tuple[Submit, Together]]:
+def ray(at_once: int, gpus: int) -> Iterator[Submit]:
     """Runs jobs as Ray tasks, on the cluster of RAY_ADDRESS or on this machine, with one core and at most one GPU."""
     package = required("ray", "ray")
     if os.environ.get("RAY_ADDRESS"):
@@ -183,7 +174,7 @@ def ray(at_once: int, gpus: int) -> Iterator[tuple[Submit, Together]]:
     threads = {"env_vars": {"OPENBLAS_NUM_THREADS": "1", "NPROC": "1"}}
     task = package.remote(num_cpus=1, num_gpus=min(gpus, 1), max_retries=0, runtime_env=threads)
     try:
-        yield lambda function, job: task(function).remote(job).future(), contextlib.nullcontext
+        yield lambda function, jobs: [task(function).remote(job).future() for job in jobs]
     finally:
         package.shutdown()
 

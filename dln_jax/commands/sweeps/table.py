@@ -89,18 +89,15 @@ def compare(
             (max if largest else min)(rivals, key=lambda row: row["validation"])["best"] = True
     groups = []
     for part in classes(rows, lambda row: [(name, text) for name, text in row["values"].items() if name not in over]):
-        numbers = {kind: [row[kind] for row in part if row[kind] is not None] for kind in names}
-        numbers = {kind: values for kind, values in numbers.items() if values}
-        worst = {kind: min if largest and kind == "validation" else max for kind in names}
-        groups.append(
-            {
-                "values": {name: text for name, text in part[0]["values"].items() if name not in over},
-                "done": sum(row["state"] == "done" for row in part),
-                "jobs": len(part),
-                "medians": {names[kind]: statistics.median(values) for kind, values in numbers.items()},
-                "worst": {names[kind]: worst[kind](values) for kind, values in numbers.items()},
-            }
-        )
+        medians, worst = {}, {}
+        for kind, name in names.items():
+            if name is not None:
+                numbers = [row[kind] for row in part if row[kind] is not None]
+                medians[name] = statistics.median(numbers) if numbers else None
+                worst[name] = (min if largest and kind == "validation" else max)(numbers, default=None)
+        values = {name: text for name, text in part[0]["values"].items() if name not in over}
+        done = sum(row["state"] == "done" for row in part)
+        groups.append({"values": values, "done": done, "jobs": len(part), "medians": medians, "worst": worst})
     return {"names": names, "over": list(over), "metrics": known, "jobs": rows, "groups": groups}
 
 
@@ -123,7 +120,6 @@ def print_results(results: Mapping[str, Any], command: str, folder: Path) -> Non
     A long sweep shows only the best jobs and the ones that are not done.
     """
     rows, over, names = results["jobs"], results["over"], results["names"]
-    shown = {kind: name for kind, name in names.items() if name is not None}
     best, missed = [row for row in rows if row["best"]], [row for row in rows if row["state"] != "done"]
     listed, title = rows, f"{command}, {len(rows)} jobs"
     if len(rows) > MOST_ROWS:
@@ -131,19 +127,19 @@ def print_results(results: Mapping[str, Any], command: str, folder: Path) -> Non
         title = f"{title} (the best, and those that are not done; all are in table.csv)"
     table = []
     for row in listed:
+        numbers = {name: row[kind] for kind, name in names.items() if name is not None}
         again = f", attempt {row['attempt']}" if row["attempt"] > 1 else ""
-        numbers = {name: row[kind] for kind, name in shown.items()}
         status = ("best" if row["best"] else row["state"]) + again
         table.append({"job": row["job"], **row["values"], **numbers, "status": status})
     print_rows(title, table)
     if over:
         table = []
         for group in results["groups"]:
-            medians = {name: group["medians"].get(name) for name in shown.values()}
             worst = {
-                f"worst {name}": group["worst"].get(name) for kind, name in shown.items() if kind != "train_seconds"
+                f"worst {name}": number for name, number in group["worst"].items() if name != names["train_seconds"]
             }
-            table.append({**group["values"], "done": f"{group['done']} of {group['jobs']}", **medians, **worst})
+            done = f"{group['done']} of {group['jobs']}"
+            table.append({**group["values"], "done": done, **group["medians"], **worst})
         print_rows(f"medians over {', '.join(over)}, and the worst", table)
     if results["metrics"] and names["validation"] is None:
         known = ", ".join(sorted(results["metrics"]))

@@ -19,8 +19,7 @@ from dln_jax import Trajectories, Tree, joint_dissipation, tree_system
 from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import every, select
-from dln_jax.identification.excitation.candidates import Design, random_designs
-from dln_jax.identification.excitation.design import CRITERIA, make_designer
+from dln_jax.identification.excitation.design import CRITERIA, Design, make_designer, random_designs
 from dln_jax.identification.excitation.limits import MotionLimits
 from dln_jax.identification.excitation.task import make_task
 from dln_jax.identification.identify import identify, parameters_of

@@ -49,8 +49,9 @@ def trained(job, resumed):
 
 
 def use(monkeypatch, submit):
-    """Lets the command submit its jobs to this function in place of processes."""
-    monkeypatch.setattr(executors, "here", lambda *_: contextlib.nullcontext((submit, contextlib.nullcontext)))
+    """Lets the command submit each job to this function in place of processes."""
+    together = contextlib.nullcontext(lambda function, jobs: [submit(function, job) for job in jobs])
+    monkeypatch.setattr(executors, "here", lambda *_: together)
 
 
 @pytest.fixture
@@ -200,8 +201,8 @@ def test_an_interrupt_cancels_the_jobs(tmp_path, monkeypatch, capsys):
 def test_an_interrupt_ends_the_processes_of_this_machine(tmp_path):
     """Jobs that have not begun never start."""
     first, second = (Job(tmp_path / name, "train_delan", (), {}, resumes=True, directory=tmp_path) for name in "ab")
-    with pytest.raises(KeyboardInterrupt), executors.here(1, 0) as (submit, _):
-        futures = [submit(run_job, job) for job in (first, second)]
+    with pytest.raises(KeyboardInterrupt), executors.here(1, 0) as submit:
+        futures = submit(run_job, (first, second))
         until = time.monotonic() + 60
         while status_of(first.folder).state != "running" and time.monotonic() < until:
             time.sleep(0.01)
@@ -221,8 +222,8 @@ def test_jobs_get_the_gpus_that_the_user_has_made_visible(monkeypatch, tmp_path)
             together.wait()  # both run at once, each with a GPU of its own
 
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-        with executors.here(2, 2) as (submit, _):
-            for future in [submit(wait_for_the_other, job) for job in jobs]:
+        with executors.here(2, 2) as submit:
+            for future in submit(wait_for_the_other, jobs):
                 future.result()
         assert devices == expected
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")

@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 from planar_arm import ARM as LEVEL
 
-from dln_jax.identification.excitation.candidates import FINER, functions_at, grid, random_designs, states
 from dln_jax.identification.excitation.design import (
     CRITERIA,
+    FINER,
     as_trajectories,
     design_set,
     error_ratio,
+    functions_at,
+    grid,
     make_designer,
+    random_designs,
+    states,
     together,
 )
 from dln_jax.identification.excitation.fourier import require_sampling, sample, state
