@@ -70,7 +70,7 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
     from dln_jax.locomotion.gradient import GradientSettings, shown_walk, train
     from dln_jax.locomotion.learning import GOAL, LANES, Goal, Record, evaluation_steps, median_to_reach
     from dln_jax.locomotion.perturbed import numbers_of, perturbed_trials
-    from dln_jax.locomotion.task import creature_named, make_task
+    from dln_jax.locomotion.task import CLOCK_PERIOD, creature_named, make_task
     from dln_jax.locomotion.worlds import Variation
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import Report, finish, png
@@ -98,7 +98,7 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
         upright=options.upright,
         speed=options.speed,
         variation=Variation(options.start, options.slope, options.rough, options.push),
-        **({} if stored is None else {"clock_period": stored.task.clock_period}),
+        clock_period=CLOCK_PERIOD if stored is None else stored.task.clock_period,
     )
     if stored is not None:
         for name, own in (("creature", stored.task.creature.name), ("width", stored.width)):

@@ -70,18 +70,13 @@ def prepare(options: Arguments, name: str) -> PreparedScene:
     if unknown := [choice for choice in choices if choice not in known]:
         option = {"strain_energy": "material"}.get(unknown[0], unknown[0].replace("_", "-"))
         raise InputError(f"the {name} scene has no --{option}; leave it out")
-    statements: tuple[str, ...] = ()
-    if options.mesh is None:
-        of_mesh = ("scale", "pin", "youngs_modulus_of", "pressure", "load")
-        refuse_given(options, of_mesh, "an option of --mesh")
-    else:
-        if beside := [name for name in ("cells", "dimension") if name in choices]:
-            raise InputError(f"--{beside[0]} sets the scene's own mesh; leave out either it or --mesh")
-        modulus = choices.get("youngs_modulus", known["youngs_modulus"].default)
-        from_file, statements = own_mesh(options, modulus)
-        choices |= {name: value for name, value in from_file.items() if name in known}
-        if "held" in from_file and "held" not in known:
-            statements = (*statements, f"the {name} scene holds no vertices: the file's `held` is not used")
+    if options.mesh is not None and (beside := [name for name in ("cells", "dimension") if name in choices]):
+        raise InputError(f"--{beside[0]} sets the scene's own mesh; leave out either it or --mesh")
+    modulus = choices.get("youngs_modulus", getattr(known.get("youngs_modulus"), "default", 0.0))
+    from_file, statements = own_mesh(options, modulus)
+    choices |= {name: value for name, value in from_file.items() if name in known}
+    if "held" in from_file and "held" not in known:
+        statements = (*statements, f"the {name} scene holds no vertices: the file's `held` is not used")
     example = scene(**choices)
     params = in_precision(example.scene.params, data_type(options.precision))
     example = example._replace(scene=example.scene._replace(params=params))
@@ -149,8 +144,11 @@ def own_mesh(options: Arguments, youngs_modulus: float) -> tuple[dict[str, Any],
         youngs_modulus: modulus of the elements that --youngs-modulus-of does not name, Pa.
 
     Raises:
-        InputError: a file that cannot be read, or a set that does not exist.
+        InputError: an option without --mesh, a file that cannot be read, or a set that does not exist.
     """
+    if options.mesh is None:
+        refuse_given(options, ("scale", "pin", "youngs_modulus_of", "pressure", "load"), "an option of --mesh")
+        return {}, ()
 
     def by_set(option: str, separator: str, count: int) -> dict[str, tuple[float, ...]]:
         """Numbers of an option by named set."""

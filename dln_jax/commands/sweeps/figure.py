@@ -15,11 +15,9 @@ MOST_PANELS = 6
 """Largest number of problems drawn in panels of their own."""
 MOST_COLOURS = 8
 """Largest number of colours in the legend."""
-RUN, MEDIAN, BEST = (
-    {"markersize": 4, "markeredgewidth": 0, "alpha": 0.45, "zorder": 2},
-    {"markersize": 8, "markeredgewidth": 0, "zorder": 3},
-    {"markersize": 13, "fillstyle": "none", "zorder": 4},
-)
+RUN: dict[str, Any] = {"markersize": 4, "markeredgewidth": 0, "alpha": 0.45, "zorder": 2}
+MEDIAN: dict[str, Any] = {"markersize": 8, "markeredgewidth": 0, "zorder": 3}
+BEST: dict[str, Any] = {"markersize": 13, "fillstyle": "none", "zorder": 4}
 
 
 def sweep_figure(results: Mapping[str, Any], at_once: int | None) -> Figure | None:
@@ -72,21 +70,19 @@ def sweep_figure(results: Mapping[str, Any], at_once: int | None) -> Figure | No
     for axis in axes[:, 0]:
         axis.set_ylabel("test " * (names["error"] in COMPARED["error"]) + spaced(names["error"]))
 
+    def handle(marker: str, label: str, **looks: Any) -> Line2D:
+        return Line2D([], [], marker=marker, label=label, **{"linestyle": "", "color": "0.4", **looks})
+
     handles = []
     if colour:
-        listed = kinds[:: -(-len(kinds) // MOST_COLOURS)]
-        handles += [
-            Line2D([], [], color=colours[kind], linewidth=5, label=f"{spaced(colour)} {kind}") for kind in listed
-        ]
-    grey = {"linestyle": "", "color": "0.4"}
+        for kind in kinds[:: -(-len(kinds) // MOST_COLOURS)]:
+            handles.append(handle("s", f"{spaced(colour)} {kind}", color=colours[kind]))
     if marker:
-        handles += [Line2D([], [], marker=markers[form], label=f"{spaced(marker)} {form}", **grey) for form in forms]
+        handles += [handle(markers[form], f"{spaced(marker)} {form}") for form in forms]
     if over:
-        handles += [Line2D([], [], marker="o", label="a run", **grey, **RUN)]
-        handles += [Line2D([], [], marker="o", label="median", **grey, **MEDIAN)]
+        handles += [handle("o", "a run", **RUN), handle("o", "median", **MEDIAN)]
     if any(row["best"] for row in rows):
-        ring = {**grey, **BEST, "color": "black", "markersize": 10}
-        handles.append(Line2D([], [], marker="o", label="best in validation", **ring))
+        handles.append(handle("o", "best in validation", **{**BEST, "color": "black", "markersize": 10}))
     if handles or unfinished(rows):
         note = {"title": unfinished(rows) or None, "title_fontsize": style.SMALL}
         style.legend(figure, handles=handles, loc="outside lower center", ncols=4, **note)

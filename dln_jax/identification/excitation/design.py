@@ -66,14 +66,10 @@ class Design(NamedTuple):
     """Limit with the smallest distance."""
 
 
-def functions_at(task: Task, t: Float[np.ndarray, " N"]) -> list[np.ndarray]:
-    """Harmonic functions and their first two derivatives at all times, [N, 2 H] each."""
+def functions_at(task: Task, finer: int = 1) -> list[np.ndarray]:
+    """Harmonic functions and their first two derivatives, [N, 2 H] each, on the design grid refined by a factor."""
+    t = task.period * np.arange(finer * task.steps) / (finer * task.steps)
     return [*map(np.asarray, jax.vmap(lambda t: harmonic_functions(task.harmonics, task.period, t))(t))]
-
-
-def grid(task: Task, finer: int = 1) -> Float[np.ndarray, " N"]:
-    """Times of one period, equally spaced and without its end: the design grid, refined by a factor `finer`."""
-    return task.period * np.arange(finer * task.steps) / (finer * task.steps)
 
 
 def states(functions: list[np.ndarray], offset: Any, coefficients: Any) -> tuple[Any, Any, Any]:
@@ -84,7 +80,7 @@ def states(functions: list[np.ndarray], offset: Any, coefficients: Any) -> tuple
 
 def furthest(task: Task, motion: FourierMotion) -> tuple[float, str]:
     """The largest excess on the fine grid, and the name of that limit."""
-    motions = states(functions_at(task, grid(task, FINER)), motion.offset, motion.coefficients)
+    motions = states(functions_at(task, FINER), motion.offset, motion.coefficients)
     parts = zip(*(np.split(np.asarray(array), FINER) for array in motions), strict=True)
     return max(worst(task.samples(*part)[2]) for part in parts)
 
@@ -121,7 +117,7 @@ def weighted(task: Task, Phi: Any) -> Any:
 
 def assess(task: Task, motion: FourierMotion) -> Design:
     """Computes information, condition and slack of a motion."""
-    at = states(functions_at(task, grid(task)), motion.offset, motion.coefficients)
+    at = states(functions_at(task), motion.offset, motion.coefficients)
     W = weighted(task, np.asarray(task.samples(*at)[0])).reshape(-1, task.columns.size)
     lengths = np.linalg.norm(W, axis=0)
     sizes = np.linalg.svd(W / np.where(lengths > 0, lengths, 1.0), compute_uv=False)
@@ -141,7 +137,7 @@ def random_designs(task: Task, count: int, *, seed: int = 0) -> list[Design]:
     require_positive(count=count)
     require_seed(seed)
     random, limits, basis = np.random.default_rng(seed), task.limits, rest_basis(task.harmonics)
-    functions = functions_at(task, grid(task, FINER))
+    functions = functions_at(task, FINER)
     lower, upper = limits.position.T
     # Dividing by the order gives all harmonics the same velocity.
     spectrum = 1 / np.tile(np.arange(1, task.harmonics + 1), 2)
@@ -199,7 +195,7 @@ def make_designer(task: Task, criterion: Criterion, *, rounds: int = 8, iteratio
         rounds: upper limit of rounds of the augmented Lagrangian.
         iterations: L-BFGS iterations per round.
     """
-    functions, basis = functions_at(task, grid(task)), rest_basis(task.harmonics)
+    functions, basis = functions_at(task), rest_basis(task.harmonics)
     middle, half = task.limits.position.mean(axis=1), np.diff(task.limits.position, axis=1)[:, 0] / 2
 
     def series(x: Any) -> tuple[Any, Any]:

@@ -13,7 +13,6 @@ from dln_jax.identification.excitation.design import (
     design_set,
     error_ratio,
     functions_at,
-    grid,
     make_designer,
     random_designs,
     states,
@@ -82,7 +81,7 @@ def test_the_information_rises(candidates, informative):
 
 def test_limits_hold_at_ten_times_the_samples_that_were_checked(task, informative):
     motion = informative.motion
-    q, qd, qdd = states(functions_at(task, grid(task, 10 * FINER)), motion.offset, motion.coefficients)
+    q, qd, qdd = states(functions_at(task, 10 * FINER), motion.offset, motion.coefficients)
     assert np.all(q >= LIMITS.position[:, 0]) and np.all(q <= LIMITS.position[:, 1])
     assert np.all(abs(qd) <= LIMITS.velocity) and np.all(abs(qdd) <= LIMITS.acceleration)
     inverse = dynamics(MODEL.energies(PARAMETERS)).inverse_dynamics
