@@ -27,18 +27,18 @@ def sweep_figure(results: Mapping[str, Any], at_once: int | None) -> Figure | No
     colours and markers. Runs are faint if there are medians.
     """
     rows, over, names = results["jobs"], results["over"], results["names"]
-    points = [(row["values"], row["train_seconds"], row["error"], RUN if over else MEDIAN) for row in rows]
-    points += [(row["values"], row["train_seconds"], row["error"], BEST) for row in rows if row["best"]]
-    for group in results["groups"] if over else ():
-        x, y = (group["medians"].get(names[kind]) for kind in ("train_seconds", "error"))
-        points.append((group["values"], x, y, MEDIAN))
+    shown = [(row["values"], row["metrics"], RUN if over else MEDIAN) for row in rows]
+    shown += [(row["values"], row["metrics"], BEST) for row in rows if row["best"]]
+    shown += [(group["values"], group["medians"], MEDIAN) for group in results["groups"] if over]
+    seconds, error = names["train_seconds"], names["error"]
+    points = [(values, numbers.get(seconds), numbers.get(error), size) for values, numbers, size in shown]
     points = [point for point in points if point[1] is not None and point[2] is not None]
     if not points:
         return None
     problems = list(dict.fromkeys(problem_of(row["values"]) for row in rows))
     panels = len(problems) <= MOST_PANELS and len(problems) < len(rows)
-    shown = [name for name in rows[0]["values"] if name not in (*over, *(PROBLEM if panels else ()))]
-    colour, marker = (*shown, "", "")[:2]
+    options = [name for name in rows[0]["values"] if name not in (*over, *(PROBLEM if panels else ()))]
+    colour, marker = (*options, "", "")[:2]
 
     def look(values: Mapping[str, str], name: str) -> str:
         return shortened(values.get(name, ""))
@@ -64,11 +64,11 @@ def sweep_figure(results: Mapping[str, Any], at_once: int | None) -> Figure | No
         axis.set_yscale(style.scale_of(y for _, _, y, _ in here))
         style.title(axis, ", ".join(f"{name} {shortened(text)}" for name, text in problem))
     beside = "" if at_once is None else f", {at_once} jobs at once" if at_once > 1 else ", one job at a time"
-    seconds = names["train_seconds"].removesuffix("_seconds").replace("train", "training")
+    work = seconds.removesuffix("_seconds").replace("train", "training")
     for axis in axes.flat[max(0, len(problems) - columns) : len(problems)]:
-        axis.set_xlabel(f"{seconds}, s{beside}")
+        axis.set_xlabel(f"{work}, s{beside}")
     for axis in axes[:, 0]:
-        axis.set_ylabel("test " * (names["error"] in COMPARED["error"]) + spaced(names["error"]))
+        axis.set_ylabel("test " * (error in COMPARED["error"]) + spaced(error))
 
     def handle(marker: str, label: str, **looks: Any) -> Line2D:
         return Line2D([], [], marker=marker, label=label, **{"linestyle": "", "color": "0.4", **looks})

@@ -47,34 +47,32 @@ def grid_of(text: str) -> dict[str, tuple[str, ...]]:
     Raises:
         InputError: empty or malformed text, a repeated option or value, an empty range, more than 10,000 combinations.
     """
-    parts = {
-        name: [_values(name, part) for part in values.split(",")] for name, values in pairs("--grid", text).items()
-    }
-    if not parts:
-        raise InputError(f"--grid names no option; {EXAMPLE}")
-    # Counted before the ranges are written out, which could exhaust the memory.
-    if (count := math.prod(sum(map(len, values)) for values in parts.values())) > MOST_JOBS:
-        raise InputError(f"--grid has {count:,} combinations; expected at most {MOST_JOBS:,}; split it into several")
-    grid = {name: tuple(map(str, itertools.chain(*values))) for name, values in parts.items()}
-    for name, values in grid.items():
+    grid: dict[str, tuple[str, ...]] = {}
+    for name, listed in pairs("--grid", text).items():
+        values: list[str] = []
+        for part in listed.split(","):
+            if not part:
+                raise InputError(f"--grid: {name} has an empty value; leave the comma out")
+            if not (numbers := RANGE.fullmatch(part)):
+                values.append(part)
+                continue
+            start, stop, step = int(numbers[1]), int(numbers[2]), int(numbers[3] or 1)
+            if step == 0:
+                raise InputError(f"--grid: {name}={part} has step 0; expected another")
+            if not (span := range(start, stop, step)):
+                raise InputError(f"--grid: {name}={part} is an empty range; its end is not part of it")
+            if len(span) > MOST_JOBS:
+                raise InputError(f"--grid: {name}={part} has {len(span):,} values; expected at most {MOST_JOBS:,}")
+            values += map(str, span)
         value, times = Counter(values).most_common(1)[0]
         if times > 1:
             raise InputError(f"--grid: {name} has {value} twice; give each value once")
+        grid[name] = tuple(values)
+    if not grid:
+        raise InputError(f"--grid names no option; {EXAMPLE}")
+    if (count := math.prod(map(len, grid.values()))) > MOST_JOBS:
+        raise InputError(f"--grid has {count:,} combinations; expected at most {MOST_JOBS:,}; split it into several")
     return grid
-
-
-def _values(name: str, text: str) -> Sequence[str | int]:
-    """One part of an option's values: a word, or a range of whole numbers."""
-    if not text:
-        raise InputError(f"--grid: {name} has an empty value; leave the comma out")
-    if not (parts := RANGE.fullmatch(text)):
-        return [text]
-    start, stop, step = int(parts[1]), int(parts[2]), int(parts[3] or 1)
-    if step == 0:
-        raise InputError(f"--grid: {name}={text} has step 0; expected another")
-    if not (numbers := range(start, stop, step)):
-        raise InputError(f"--grid: {name}={text} is an empty range; its end is not part of it")
-    return numbers
 
 
 def jobs_of(

@@ -81,20 +81,18 @@ def compare(
             )
     names = {kind: next((name for name in usual if name in known), None) for kind, usual in COMPARED.items()}
     names |= {kind: name for kind, name in (("validation", metric), ("error", error)) if name is not None}
-    for row in rows:
-        row |= {kind: row["metrics"].get(name) for kind, name in names.items()}
-    chosen = [row for row in rows if row["validation"] is not None]
+    judge = names["validation"]
+    chosen = [row for row in rows if row["metrics"].get(judge) is not None]
     for rivals in classes(chosen, lambda row: problem_of(row["values"])):
         if len(rivals) > 1:
-            (max if largest else min)(rivals, key=lambda row: row["validation"])["best"] = True
+            (max if largest else min)(rivals, key=lambda row: row["metrics"][judge])["best"] = True
     groups = []
     for part in classes(rows, lambda row: [(name, text) for name, text in row["values"].items() if name not in over]):
         medians, worst = {}, {}
-        for kind, name in names.items():
-            if name is not None:
-                numbers = [row[kind] for row in part if row[kind] is not None]
-                medians[name] = statistics.median(numbers) if numbers else None
-                worst[name] = (min if largest and kind == "validation" else max)(numbers, default=None)
+        for name in filter(None, names.values()):
+            numbers = [number for row in part if (number := row["metrics"].get(name)) is not None]
+            medians[name] = statistics.median(numbers) if numbers else None
+            worst[name] = (min if largest and name == judge else max)(numbers, default=None)
         values = {name: text for name, text in part[0]["values"].items() if name not in over}
         done = sum(row["state"] == "done" for row in part)
         groups.append({"values": values, "done": done, "jobs": len(part), "medians": medians, "worst": worst})
@@ -127,7 +125,7 @@ def print_results(results: Mapping[str, Any], command: str, folder: Path) -> Non
         title = f"{title} (the best, and those that are not done; all are in table.csv)"
     table = []
     for row in listed:
-        numbers = {name: row[kind] for kind, name in names.items() if name is not None}
+        numbers = {name: row["metrics"].get(name) for name in filter(None, names.values())}
         again = f", attempt {row['attempt']}" if row["attempt"] > 1 else ""
         status = ("best" if row["best"] else row["state"]) + again
         table.append({"job": row["job"], **row["values"], **numbers, "status": status})
