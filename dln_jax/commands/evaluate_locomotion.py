@@ -37,11 +37,10 @@ class Arguments(Folder):
 
 def main(options: Arguments) -> None:
     """Evaluates the policy, prints and writes the numbers."""
-    from dln_jax.files import write_json
+    from dln_jax.commands.locomotion.policies import judge, load_policy
     from dln_jax.locomotion.perturbed import numbers_of, perturbed_trials
-    from dln_jax.runs.report import print_numbers
+    from dln_jax.runs.report import Report, finish
     from dln_jax.runs.stored_arguments import command_folder
-    from dln_jax.training.locomotion_evaluation import judge, load_policy
     from dln_jax.types import require_positive, require_seed
 
     sizes = {"starts": options.starts, "steps": options.steps}
@@ -52,11 +51,8 @@ def main(options: Arguments) -> None:
     with command_folder(options, "evaluate_locomotion") as folder:
         trials = perturbed_trials(task, policy, parameters, **sizes, seed=options.seed)
         verdict, numbers = judge(trials, options.steps), numbers_of(trials, options.steps)
-        write_json(folder / "metrics.json", {**numbers, "verdict": float(verdict.number)})
         rows = [(name.replace("_", " "), f"{value:.4g}") for name, value in numbers.items()]
-        ground_shown = ", ".join(f"{name} {value:g}" for name, value in task.variation._asdict().items())
-        print_numbers(rows, title=f"{task.creature.name}: {ground_shown}", columns=("quantity", "value"))
-        print(verdict.line)
-        print(f"run folder: {folder}")
-    if verdict.level == "refused":
-        raise SystemExit(1)
+        title = ", ".join(f"{name} {value:g}" for name, value in task.variation._asdict().items())
+        title = f"{task.creature.name}: {title}"
+        metrics = {**numbers, "verdict": float(verdict.number)}
+        finish(folder, options, Report(metrics, rows, title, ("quantity", "value"), verdict=verdict))

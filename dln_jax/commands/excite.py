@@ -9,12 +9,12 @@ state them. A list of numbers has one for each joint.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
-from dln_jax.options import Unstated, choice
+from dln_jax.errors import InputError
+from dln_jax.options import Unstated
+from dln_jax.runs.arguments import names_listed, numbers_of
 from dln_jax.runs.options import Drawn, Folder
-
-VALIDATION = "validation"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,8 +33,6 @@ class Arguments(Folder, Drawn):
     """Number of motions for identification; one more is for validation."""
     starts: int = 4
     """Number of random starting motions for each optimised motion."""
-    criterion: Annotated[str, choice(("information", "condition"))] = "information"
-    """information: minimise the product of the parameters' errors; condition: the regressor's condition number."""
     friction: bool = True
     """Include viscous and dry friction and an offset of each joint in the parameters."""
     velocity_scale: float = 0.05
@@ -66,6 +64,145 @@ class Arguments(Folder, Drawn):
 
 def main(options: Arguments) -> None:
     """Designs the motions, writes them and prints a summary."""
-    from dln_jax.training.excitation import excite
+    import jax
+    import numpy as np
 
-    excite(options)
+    from dln_jax.data import schema
+    from dln_jax.data.csv_tables import write_motion
+    from dln_jax.data.robots import read_robot
+    from dln_jax.figures.torques import excitation_figure
+    from dln_jax.files import write_figure, write_json
+    from dln_jax.identification.excitation.design import (
+        as_trajectories,
+        design_set,
+        error_ratio,
+        random_designs,
+        together,
+    )
+    from dln_jax.identification.excitation.fourier import require_sampling
+    from dln_jax.identification.excitation.limits import heights_above, limits_of_robot, scale_limits
+    from dln_jax.identification.excitation.task import make_task
+    from dln_jax.mechanics.trees.description import with_payload
+    from dln_jax.mechanics.trees.inertia import inertial_parameters
+    from dln_jax.models.trees import make_rigid_tree
+    from dln_jax.runs.progress import progress
+    from dln_jax.runs.report import Report, finish
+    from dln_jax.runs.stored_arguments import command_folder
+    from dln_jax.sizes import require_memory
+    from dln_jax.types import require_positive
+
+    count = options.trajectories
+    require_positive(trajectories=count, starts=options.starts)
+    require_sampling(period=options.seconds, harmonics=options.harmonics, rate=options.rate)
+    robot = read_robot(options.robot)
+    tree, d = robot.tree, robot.tree.degrees_of_freedom
+    samples = options.seconds * options.rate * (count + 1)
+    # Positions, rates and torques in the copies that are written and drawn.
+    require_memory(f"{samples:.3g} samples (--seconds, --rate and --trajectories)", 100.0 * d * samples)
+    if options.payload is not None:
+        require_positive(payload=options.payload)
+        centre = numbers_of("--payload-position", options.payload_position, [3])
+        tree = with_payload(tree, d - 1, inertial_parameters(options.payload, centre, np.zeros((3, 3))))
+    elif options.payload_position != "0,0,0":
+        raise InputError("--payload-position is for a --payload, which is not given; add its mass, or leave it out")
+    texts = {name: getattr(options, name) for name in ("position", "velocity", "acceleration", "torque")}
+    stated = {
+        name: None if text is None else numbers_of(f"--{name}", text, [1, d], positive=True)
+        for name, text in texts.items()
+    }
+    limits, assumed = limits_of_robot(
+        robot, force=stated.pop("torque"), **stated, allow_unlimited=names_listed(options.allow_unlimited)
+    )
+    for line in assumed:
+        print(f"warning: {line}")
+    limits = scale_limits(limits, options.share)
+    model = make_rigid_tree(tree, friction=options.friction, velocity_scale=options.velocity_scale)
+    parameters: Any = model.init(jax.random.key(0))
+    if options.friction:
+        parameters = parameters._replace(viscous=robot.damping, coulomb=robot.coulomb)
+    task = make_task(
+        model,
+        parameters,
+        limits,
+        period=options.seconds,
+        harmonics=options.harmonics,
+        clearance=None if options.height is None else heights_above(tree, options.height),
+        noise=numbers_of("--noise", options.noise, [1, d], positive=True),
+        seed=options.seed,
+    )
+    names = tree.names or tuple(f"joint_{k}" for k in range(d))
+    labels = [*(f"train-{place + 1}" for place in range(count)), "validation"]
+    with command_folder(options, "excite") as folder:
+        drawn = random_designs(task, (count + 1) * options.starts, seed=options.seed)
+        with progress(count + 1, "motions") as show:
+            train, validation = design_set(task, drawn, trajectories=count, say=show)
+        designs = [*train, validation]
+
+        def data_at(rate: float) -> schema.Trajectories:
+            """The motions with their predicted torques, at this sampling rate in Hz."""
+            needs = tree.needs._replace(friction=bool(robot.damping.any()))
+            data = as_trajectories(designs, labels, model, parameters, rate=rate, needs=needs)
+            return data._replace(joint_names=np.array(names))
+
+        data = data_at(options.rate)
+        schema.save(folder / "excitation.npz", data)
+        for index, label in enumerate(labels):
+            rows = data.trajectory == index
+            columns = (data.t[rows], data.q[rows], data.qd[rows])
+            write_motion(folder / f"{label}.csv", *columns, names=names, joints=tree.joints)
+        motions = {label: design.motion for label, design in zip(labels, designs, strict=True)}
+        series = {
+            label: {
+                "period": motion.period,
+                "offset": np.asarray(motion.offset).tolist(),
+                "sines": np.asarray(motion.coefficients)[:, : options.harmonics].tolist(),
+                "cosines": np.asarray(motion.coefficients)[:, options.harmonics :].tolist(),
+            }
+            for label, motion in motions.items()
+        }
+        write_json(folder / "motions.json", {"joints": list(names), "motions": series})
+
+        # A random set combines as many motions as the training set.
+        groups = [drawn[place : place + count] for place in range(0, len(drawn) - count + 1, count)]
+        ratios = [error_ratio(train, group) for group in groups]
+        conditions = {
+            "random": [design.condition for design in drawn],
+            "designed": [design.condition for design in designs],
+        }
+        size = float(task.columns.size)
+        metrics = {
+            "base_parameters": size,
+            "random_condition_median": float(np.median(conditions["random"])),
+            "random_condition_best": min(conditions["random"]),
+            "train_condition_worst": max(conditions["designed"][:-1]),
+            "validation_condition": validation.condition,
+            "random_set_condition_median": float(np.median([together(group)[0] for group in groups])),
+            "train_set_condition": together(train)[0],
+            "random_log_determinant_median": float(np.median([design.log_determinant for design in drawn])),
+            "train_set_log_determinant": together(train)[1],
+            "standard_error_ratio_median": float(np.median(ratios)),
+            "standard_error_ratio_worst": float(np.max(ratios)),
+            "least_slack": min(design.slack for design in designs),
+        }
+
+        rows = [
+            ("random, median", metrics["random_condition_median"], metrics["random_log_determinant_median"], ""),
+            *(
+                (label, design.condition, design.log_determinant, design.nearest)
+                for label, design in zip(labels, designs, strict=True)
+            ),
+            (f"random, {count} together", metrics["random_set_condition_median"], np.nan, ""),
+            (f"train, {count} together", *together(train), ""),
+        ]
+        table = [(name, f"{number:.3g}", f"{logarithm:.1f}", near) for name, number, logarithm, near in rows]
+        shown = {"q": limits.position, "qd": np.stack([-limits.velocity, limits.velocity], 1), "tau": limits.force}
+
+        def draw(path: Path) -> None:
+            # The figure is some thousand points wide: a higher rate would not show.
+            data = data_at(max(400, 3 * options.harmonics) / options.seconds)
+            write_figure(path, excitation_figure(data, shown, names=names, conditions=conditions))
+
+        ratio = metrics["standard_error_ratio_median"]
+        line = f"standard errors of {size:.0f} base parameters: {ratio:.2f} of those after random motions, on average"
+        columns = ("motion", "condition", "log det", "nearest limit")
+        finish(folder, options, Report(metrics, table, "", columns, lines=(line,), figures={"excitation.png": draw}))

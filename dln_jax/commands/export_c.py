@@ -47,12 +47,8 @@ def main(options: Arguments) -> None:
     """Exports the model, and prints the files and the functions left out."""
     from dln_jax.export.c.run import export_run
 
-    paths = export_run(
-        options.run, options.out, functions=options.functions, name=options.name, precision=options.precision,
-        iterations=options.iterations, temperature=options.temperature, libm=options.libm, casadi=options.casadi,
-        finite=options.finite,
-        overwrite=options.overwrite,
-    )  # fmt: skip
+    settings = dict(vars(options))
+    paths = export_run(settings.pop("run"), settings.pop("out"), **settings)
     print(f"{options.out}: {', '.join(path.name for path in paths)}")
     for path in paths:
         if path.suffix in (".h", ".c"):

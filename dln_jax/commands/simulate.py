@@ -11,12 +11,17 @@ An .npz has `vertices` [n, 2 or 3] in m, `elements` [m, 3 or 4] (triangles or te
 beam, optionally `held` [k] (vertices; by default those of the smallest x).
 """
 
+import dataclasses
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from dln_jax.options import Unstated
 from dln_jax.runs.options import Drawn, Folder
+
+GALLERY = (0, 3, 2, 1, 4)
+"""Order of the scenes in the combined picture."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +33,6 @@ class Arguments(Folder, Drawn):
     integrator: Literal["backward-euler", "bdf2", "midpoint", "average-vector-field"] = "backward-euler"
     """backward-euler damps, bdf2 (second order) damps little, midpoint (second order) does not damp,
     average-vector-field (second order) keeps the energy."""
-    halvings: int = 0
-    """Repeat steps that do not converge in shorter parts, down to --dt / 2^halvings; not with bdf2."""
     dt: Unstated[float] = None
     """Time step in s."""
     seconds: Unstated[float] = None
@@ -42,10 +45,6 @@ class Arguments(Folder, Drawn):
     """E in Pa; not for the creature."""
     poisson_ratio: Unstated[float] = None
     """Between -1 and 0.5; not for the creature."""
-    friction: Unstated[float] = None
-    """slope, drop: Coulomb's coefficient of friction."""
-    turns: Unstated[float] = None
-    """twist: turns of one end against the other."""
     material: Unstated[Literal["stable-neo-hookean", "neo-hookean", "st-venant-kirchhoff", "corotated"]] = None
     """Not for the creature (default: stable-neo-hookean)."""
     order: Unstated[int] = None
@@ -72,12 +71,60 @@ class Arguments(Folder, Drawn):
     """Also write motion.pvd and its .vtu files, for ParaView (extra [mesh])."""
     precision: Literal["f32", "f64"] = "f64"
     """Floating-point type."""
-    seed: int = 0
-    """drop: seed of the rate of rotation and of the box's tilt."""
 
 
 def main(options: Arguments) -> None:
     """Simulates one scene into the run folder, or all scenes into subfolders with a combined picture."""
-    from dln_jax.training.simulation import simulate_all
+    import jax.numpy as jnp
 
-    simulate_all(options)
+    from dln_jax.commands.simulations.motion import LABELS, figures_of, moments_of, results, run_motion, warnings
+    from dln_jax.commands.simulations.scenes import announce, prepare
+    from dln_jax.figures.soft_bodies import moments_figure
+    from dln_jax.files import write_figure
+    from dln_jax.metrics.report import conditions, write_report
+    from dln_jax.precision import data_type
+    from dln_jax.runs.report import Report, finish
+    from dln_jax.runs.stored_arguments import command_folder
+    from dln_jax.softbody.examples import EXAMPLES
+    from dln_jax.softbody.mesh.files import write_motion
+
+    several, precision = options.scene == "all", data_type(options.precision)
+    scenes = [prepare(options, name) for name in (EXAMPLES if several else [options.scene])]
+    with command_folder(options, "simulate") as folder:
+        pictures = []
+        for prepared in scenes:
+            name, example, dt = prepared.name, prepared.example, prepared.dt
+            own, mesh = folder / name if several else folder, example.scene.mesh
+            own.mkdir(exist_ok=True)
+            announce(prepared, options)
+            motion = run_motion(prepared, precision)
+            rows = results(name, mesh, motion)
+            dtype = jnp.dtype(precision).name
+            facts = conditions(dtype=dtype, seeds=[0], integrator=options.integrator, dt=dt)
+            write_report(own / "report.json", rows, facts)
+            if options.vtu:
+                shown = slice(motion.finite)
+                moving = mesh, motion.t[shown], motion.x[shown], motion.v[shown]
+                write_motion(own / "motion.pvd", *moving, stride=motion.stride)
+            pictures.append(moments_of(name, example, motion))
+            table = [
+                (
+                    LABELS.get(row.quantity, row.quantity.replace("_", " ")),
+                    f"{row.value:.4g}",
+                    "" if row.unit == "1" else row.unit,
+                )
+                for row in rows
+            ]
+            title = f"{name}: {options.integrator}, dt = {dt:.4g} s"
+            report = Report(
+                metrics={row.quantity: row.value for row in rows if math.isfinite(row.value)},
+                rows=table,
+                title="",
+                lines=tuple(warnings(motion)),
+                figures=figures_of(name, example, motion, pictures[-1], title),
+                chosen={"dt": dt, "seconds": prepared.steps * dt},
+            )
+            finish(own, dataclasses.replace(options, scene=name), report)
+        if several and options.figures:
+            gallery = moments_figure([pictures[i] for i in GALLERY], columns=3)
+            write_figure(folder / "soft-bodies.png", gallery)

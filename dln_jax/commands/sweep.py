@@ -7,11 +7,16 @@ validation alone. Jobs that fail are listed with their error message, and the ex
 jobs that are not done. slurm needs the extra [sweep], ray the extra [ray]; hosts must share the sweep's folder.
 """
 
+import importlib
+import shlex
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar, Literal
 
 from dln_jax.commands import COMMANDS
+from dln_jax.errors import InputError
 from dln_jax.options import Unstated
+from dln_jax.runs.arguments import names_in, require_positive_if_given
 from dln_jax.runs.options import Resumable
 
 
@@ -50,6 +55,56 @@ class Arguments(Resumable):
 
 def main(options: Arguments) -> None:
     """Checks the grid, runs the jobs and shows the results; raises `SystemExit` with 1 if a job is not done."""
-    from dln_jax.commands.sweeps.command import sweep
+    from dln_jax.commands.sweeps.executors import cores, here, ray, run, slurm
+    from dln_jax.commands.sweeps.figure import sweep_figure
+    from dln_jax.commands.sweeps.grid import closest, grid_of, jobs_of, pairs
+    from dln_jax.commands.sweeps.job import status_of
+    from dln_jax.commands.sweeps.table import compare, print_results, write_tables
+    from dln_jax.files import write_figure
+    from dln_jax.runs.progress import progress
+    from dln_jax.runs.stored_arguments import command_folder
 
-    sweep(options, COMMANDS)
+    require_positive_if_given(options, ("jobs", "gpus"))
+    grid, fixed, where = grid_of(options.grid or ""), pairs("--fixed", options.fixed), options.where or "here"
+    if options.jobs is not None and options.jobs > (options.gpus or options.jobs):
+        raise InputError(f"--jobs {options.jobs} for --gpus {options.gpus}; each job has one: give fewer jobs")
+    over = ["seed"] if "seed" in grid else []
+    if options.over is not None:
+        over = names_in("--over", options.over.replace("-", "_"), grid)
+    if options.slurm is not None and where not in ("slurm", "later"):
+        raise InputError(f"--slurm is for --where slurm; leave it out of --where {where}")
+    pairs("--slurm", options.slurm or "")
+    command, known = options.command.replace("-", "_"), [name for name in COMMANDS if name != "sweep"]
+    if command not in known:
+        like = closest(command, known)
+        raise InputError(f"--command: there is no {command!r:.40}{like} (see python -m dln_jax --help)")
+    arguments = importlib.import_module(f"dln_jax.commands.{command}").Arguments
+    jobs_of(command, arguments, grid, fixed, Path())  # mistakes are refused before there is a folder
+    at_once = options.jobs or (None if where == "slurm" else options.gpus or cores())
+    with command_folder(options, "sweep") as out:
+        folder = out.absolute()
+        jobs = jobs_of(command, arguments, grid, fixed, folder)
+        left = [job for job in jobs if status_of(job.folder).state != "done"]
+        if where == "later":
+            lines = folder / "jobs.sh"
+            lines.write_text("".join(f"{shlex.join(job.line(job.folder / 'run'))}\n" for job in left))
+            print(f"{len(left)} jobs, a line each in {lines}, to be run from {Path.cwd()}")
+            print(f"the table is made by: --out {folder} --resume --where here")
+            return
+        if left:
+            if where == "slurm":
+                executor = slurm(folder, at_once, options.slurm or "", len(left))
+            else:
+                executor = (ray if where == "ray" else here)(at_once or 1, options.gpus or 0)
+            done = f", {len(jobs) - len(left)} are done" if len(left) < len(jobs) else ""
+            share = "an array of the cluster" if at_once is None else f"{at_once} at once"
+            with executor as submit, progress(len(left), "jobs") as show:
+                print(f"{command}: {len(left)} of {len(jobs)} jobs{done}; {where}, {share}", flush=True)
+                run(left, submit, lambda ended, bad: show(ended, f"{bad} not done" if bad else ""))
+        results = compare(jobs, over, metric=options.metric, error=options.error, largest=options.best == "largest")
+        write_tables(folder, {"command": command, "where": where, "at_once": at_once, **results})
+        if figure := sweep_figure(results, at_once):
+            write_figure(folder / "sweep.png", figure)
+        print_results(results, command, folder)
+        if any(row["state"] != "done" for row in results["jobs"]):
+            raise SystemExit(1)

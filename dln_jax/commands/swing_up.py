@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from dln_jax.options import Unstated, choice
-from dln_jax.runs.arguments import Unstated, choice
 from dln_jax.runs.options import Drawn, Folder
 
 

@@ -9,39 +9,164 @@ metrics.json, the model of the best seed, a figure of the learning, and a GIF of
 the policy on other ground.
 """
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
+from dln_jax.errors import InputError
 from dln_jax.options import Unstated
+from dln_jax.runs.arguments import require_positive_if_given
 from dln_jax.runs.options import Drawn, Resumable, Scaled
-from dln_jax.training.locomotion_options import LocomotionOptions
+
+STEPS = 400_000
 
 
 @dataclass(frozen=True)
-class Arguments(LocomotionOptions, Resumable, Drawn, Scaled):
-    """What to train, how, and where the results go."""
+class Arguments(Resumable, Drawn, Scaled):
+    """Creature, task and training, and where the results go."""
 
+    creature: Literal["crawler", "biped", "quadruped", "box-quadruped"] = "crawler"
+    """Body of the creature."""
+    seed: int = 0
+    """First seed, 0 to 4294967295."""
+    seeds: int = 1
+    """Number of seeds, trained one after the other."""
+    steps: Unstated[int] = None
+    """Environment steps of each seed (default: 400000)."""
+    until: Unstated[float] = None
+    """The training of a seed ends at this distance, in body lengths (default: no limit)."""
+    upright: float = 0.05
+    """Weight of the posture in the reward, body lengths per step."""
+    speed: float = 0.04
+    """The reward saturates at this speed, body lengths per step; 0 for no limit."""
+    episode: int = 400
+    """Length of an episode, in steps of 0.033 s."""
+    start: float = 0.01
+    """Standard deviation of the vertices' initial positions, m; of their velocities, 10 times as much in m/s."""
+    slope: float = 0.0
+    """Largest slope of the ground, degrees."""
+    rough: float = 0.0
+    """Largest height of bumps, m."""
+    push: float = 0.0
+    """Change of velocity by the pushes, m/s."""
+    window: int = 32
+    """Number of steps that gradients go back."""
+    width: int = 64
+    """Hidden units of the policy."""
     stored: Unstated[Path] = None
     """Folder of a run whose policy is trained further, perhaps on other ground (default: a new policy)."""
 
 
-def main(options: Arguments) -> None:
-    """Trains and evaluates the policy, and writes the run folder."""
-    from dln_jax.locomotion.gradient import settings_of
-    from dln_jax.runs.report import print_numbers
+def main(options: Arguments, *, lanes: int = 4) -> None:
+    """Trains and evaluates the policy, and writes the run folder.
+
+    Args:
+        lanes: number of creatures simulated side by side, which devices share; even.
+    """
+    import numpy as np
+
+    from dln_jax.commands.locomotion.figures import SHOWN, learning_figure, write_gait
+    from dln_jax.commands.locomotion.policies import NAME, judge, load_policy
+    from dln_jax.locomotion.gradient import GradientSettings, shown_walk, train
+    from dln_jax.locomotion.learning import GOAL, LANES, Goal, Record, evaluation_steps, median_to_reach
+    from dln_jax.locomotion.perturbed import numbers_of, perturbed_trials
+    from dln_jax.locomotion.task import CLOCK_PERIOD, creature_named, make_task
+    from dln_jax.locomotion.worlds import Variation
+    from dln_jax.runs.progress import progress
+    from dln_jax.runs.report import Report, finish, png
     from dln_jax.runs.scaled import mesh_of
     from dln_jax.runs.stored_arguments import command_folder
-    from dln_jax.training.locomotion import announce, prepare, trained, write_run
-    from dln_jax.training.locomotion_evaluation import parameters_for
+    from dln_jax.scale.devices import device_lines
+    from dln_jax.scale.mesh import shares
+    from dln_jax.softbody.terms.creature import TIME_STEP
+    from dln_jax.types import require_positive, require_seed
+    from dln_jax.zoo.parameter_files import save_tree
+    from dln_jax.zoo.run import MODEL
 
-    mesh = mesh_of(options)
-    task = prepare(options, mesh)
-    initial = None if options.stored is None else parameters_for(task, options.width, options.stored)
+    mesh, settings = mesh_of(options), GradientSettings(window=options.window, lanes=lanes)
+    require_positive(seeds=options.seeds, width=options.width, episode=options.episode, **settings._asdict())
+    require_positive_if_given(options, ["steps", "until"])
+    require_seed(options.seed, options.seeds)
+    for name in ("upright", "speed"):
+        if not 0 <= getattr(options, name) < math.inf:
+            raise InputError(f"--{name} is {getattr(options, name)}; expected 0 or a positive number")
+    shares(mesh, lanes, LANES)
+    stored = None if options.stored is None else load_policy(options.stored)
+    task = make_task(
+        creature_named(options.creature),
+        episode=options.episode,
+        upright=options.upright,
+        speed=options.speed,
+        variation=Variation(options.start, options.slope, options.rough, options.push),
+        clock_period=CLOCK_PERIOD if stored is None else stored.task.clock_period,
+    )
+    if stored is not None:
+        for name, own in (("creature", stored.task.creature.name), ("width", stored.width)):
+            if (wanted := getattr(options, name)) != own:
+                raise InputError(f"the policy in {options.stored} has {name} {own}, not {wanted}; give --{name} {own}")
     with command_folder(options, "train_locomotion") as folder:
-        announce(task)
-        policies = trained(task, options, mesh, initial=initial, directory=folder, resume=options.resume)
-        settings = {"width": options.width, **settings_of(options.window, options.lanes)._asdict()}
-        numbers = write_run(folder, task, policies, settings, figures=options.figures)
-        rows = [(name.replace("_", " "), f"{value:.4g}") for name, value in numbers.items()]
-        print_numbers(rows, title=f"{options.creature}, gradient", columns=("quantity", "value"))
-        print(f"run folder: {folder}")
+        size = f"{len(task.creature.mesh.vertices)} vertices, {task.muscle_count} muscles, {task.length:.3g} m long"
+        print(f"{task.creature.name}: {size}; episodes of {task.episode} steps of {TIME_STEP} s; f64")
+        for line in device_lines("f64"):
+            print(line)
+        steps = options.steps or STEPS
+        with progress(options.seeds * steps, "environment steps") as show:
+
+            def report(seed: int, at: Record) -> None:
+                done = (seed - options.seed) * steps + min(at.steps, steps)
+                skipped = f", {at.skipped} skipped" if at.skipped else ""
+                succeeded = f"{at.succeeded:.0%} of starts succeed{skipped}"
+                show(done, f"gradient, seed {seed}: {at.distance:.3f} body lengths, {succeeded}")
+
+            policies = train(
+                task,
+                seeds=range(options.seed, options.seed + options.seeds),
+                goal=Goal(steps, options.until or math.inf),
+                width=options.width,
+                settings=settings,
+                initial=None if stored is None else stored.parameters,
+                directory=folder,
+                resume=options.resume,
+                mesh=mesh,
+                report=report,
+            )
+        best = policies.best
+        if not math.isfinite(best.distance):
+            raise InputError(
+                f"no evaluation converged; {folder} holds no model: lower the number of steps or the width"
+            )
+        facts = {"name": NAME, "creature": task.creature.name, "precision": "f64", "clock_period": task.clock_period}
+        facts |= {"variation": task.variation._asdict(), "settings": {"width": options.width, **settings._asdict()}}
+        save_tree(folder, MODEL, best.parameters, {"model": facts})
+        start = SHOWN if task.variation.rough else None
+        seen = shown_walk(task, policies.policy, best.parameters, task.episode, start)
+        curves = [seed.records for seed in policies.learned]
+        heights = seen.x[:, :, -1].mean(axis=1) / task.creature.mesh.vertices[:, -1].mean()
+        metrics = {
+            "distance_body_lengths": best.distance,
+            "distance_body_lengths_median": np.median([float(seed.distance) for seed in policies.learned]),
+            "environment_steps": best.records[-1].steps,
+            "evaluation_steps": len(best.records) * evaluation_steps(task),
+            "environment_steps_to_five_body_lengths": median_to_reach(curves, GOAL, "steps"),
+            "seconds_to_five_body_lengths": median_to_reach(curves, GOAL, "seconds"),
+            "compile_seconds": best.compile_seconds,
+            "train_seconds": best.records[-1].seconds - best.compile_seconds,
+            "skipped_updates": best.records[-1].skipped,
+            "largest_tilt_rad": np.abs(seen.tilt).max(),
+            "least_height": heights.min(),
+        }
+        metrics, lines = {name: float(value) for name, value in metrics.items() if math.isfinite(value)}, ()
+        if any(task.variation):
+            trials = perturbed_trials(task, policies.policy, best.parameters)
+            verdict = judge(trials)
+            metrics |= {**numbers_of(trials), "verdict": float(verdict.number)}
+            lines = (verdict.line,)
+        title = f"{options.creature}, gradient"
+        shown = f"{title}: {best.distance:.2f} body lengths"
+        figures = {
+            "learning.png": png(learning_figure, curves),
+            "gait.gif": lambda path: write_gait(path, task, seen, shown),
+        }
+        rows = [(name.replace("_", " "), f"{value:.4g}") for name, value in metrics.items()]
+        finish(folder, options, Report(metrics, rows, title, ("quantity", "value"), lines=lines, figures=figures))

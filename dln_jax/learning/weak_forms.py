@@ -34,7 +34,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float, Int
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.data.encoders.sampling import EVEN, delayed, held_at_equal_steps
+from dln_jax.data.encoders.sampling import EVEN, delay_held, held_at_equal_steps
 from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import segments, select
@@ -323,7 +323,7 @@ def driven_torques(data: Trajectories, *, delay: float) -> Trajectories:
     acting = np.zeros_like(data.tau)
     for index in np.unique(data.trajectory):
         rows = np.flatnonzero(data.trajectory == index)
-        steps = delayed(data.tau[rows], float(delay))
+        steps = delay_held(data.tau[rows], float(delay))
         acting[rows] = (np.concatenate([np.zeros_like(steps[:1]), steps[:-1]]) + steps) / 2
     return data._replace(tau=acting)
 

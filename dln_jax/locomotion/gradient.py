@@ -110,20 +110,13 @@ class TrainedPolicies(NamedTuple):
         return max(self.learned, key=lambda seed: rank(seed.selected))
 
 
-def settings_of(window: int | None = None, lanes: int | None = None) -> GradientSettings:
-    """Returns the settings, with another window or number of lanes if given."""
-    stated = {name: value for name, value in (("window", window), ("lanes", lanes)) if value is not None}
-    return GradientSettings()._replace(**stated)
-
-
 def train(
     task: LocomotionTask,
     *,
     seeds: Sequence[int],
     goal: Goal,
     width: int = WIDTH,
-    window: int | None = None,
-    lanes: int | None = None,
+    settings: GradientSettings = GradientSettings(),  # noqa: B008
     initial: Parameters | None = None,
     directory: Path | None = None,
     resume: bool = False,
@@ -136,8 +129,7 @@ def train(
         seeds: seeds, trained one after the other; programs are compiled once.
         goal: conditions that end the training of a seed.
         width: width of the policy's hidden layer.
-        window: number of steps that gradients go back (default: 32).
-        lanes: number of creatures side by side (default: 4).
+        settings: settings of the learner.
         initial: parameters of a policy of this width to train further (default: random).
         directory: folder where states are stored.
         resume: continue the runs stored there.
@@ -147,7 +139,6 @@ def train(
     Raises:
         InputError: settings are out of range, a stored run has others, or the mesh does not divide the creatures.
     """
-    settings = settings_of(window, lanes)
     policy = make_policy(task, width=width)
     if initial is not None:
         policy = policy._replace(init=lambda _: initial)

@@ -12,13 +12,14 @@ successful starts, and among those the one that goes farthest.
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import haiku as hk
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
@@ -63,6 +64,10 @@ class Policy(NamedTuple):
     """Observation -> change of the actuation."""
 
 
+GOAL = 5.0
+"""The effort of learning is measured up to this distance, in body lengths."""
+
+
 class Record(NamedTuple):
     """One evaluation."""
 
@@ -76,6 +81,15 @@ class Record(NamedTuple):
     """Number of updates skipped so far because a step of the simulator did not converge."""
     succeeded: float = 0.0
     """Share of starts that end without a fall and at least a body length ahead."""
+
+
+def median_to_reach(seeds: Sequence[Sequence[Record]], distance: float, field: str) -> float:
+    """Median over seeds of the "steps" or "seconds" to the distance; infinite if at least half never reached it."""
+    reached = [
+        next((getattr(record, field) for record in records if record.distance >= distance), math.inf)
+        for records in seeds
+    ]
+    return float(np.median(reached))
 
 
 def rank(record: Record | None) -> tuple[float, float]:

@@ -190,6 +190,19 @@ def names_in(option: str, text: str, known: Iterable[str]) -> list[str]:
     return names
 
 
+def pairs_of(option: str, words: Iterable[str]) -> dict[str, str]:
+    """Splits words NAME=VALUE; `InputError` for other words and for repeated names."""
+    values: dict[str, str] = {}
+    for word in words:
+        name, _, value = (part.strip() for part in word.partition("="))
+        if not (name and value):
+            raise InputError(f"{option} has {word!r:.60}, which is no NAME=VALUE")
+        if name in values:
+            raise InputError(f"{option} names '{name:.60}' twice; give it once")
+        values[name] = value
+    return values
+
+
 def numbers_of(option: str, text: str, counts: Collection[int] = (), *, positive: bool = False) -> tuple[float, ...]:
     """Parses the comma-separated numbers of an option.
 

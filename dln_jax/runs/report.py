@@ -20,7 +20,7 @@ class Report(NamedTuple):
     metrics: Mapping[str, float | int]
     """Contents of metrics.json."""
     rows: Iterable[Sequence[str]]
-    """Rows of the printed table."""
+    """Rows of the printed table; none where lines say all."""
     title: str
     columns: tuple[str, ...] = ("quantity", "value", "unit")
     verdict: Verdict | None = None
@@ -53,7 +53,8 @@ def finish(folder: Path, options: Any, report: Report) -> None:
     verdict = report.verdict
     stored = {} if verdict is None else {"verdict": verdict._asdict()}
     write_config(folder, options, **report.chosen, **stored)
-    print_numbers(report.rows, title=report.title, columns=report.columns)
+    if report.rows:
+        print_numbers(report.rows, title=report.title, columns=report.columns)
     for text in (*report.lines, f"run folder: {folder}"):
         print(text)
     refused = verdict is not None and verdict.level == "refused"
@@ -74,11 +75,15 @@ def finish(folder: Path, options: Any, report: Report) -> None:
 
 
 def print_numbers(
-    rows: Iterable[Sequence[str]], *, title: str | None = None, columns: Sequence[str] = ("quantity", "value", "unit")
+    rows: Iterable[Sequence[str]],
+    *,
+    title: str | None = None,
+    columns: Sequence[str] = ("quantity", "value", "unit"),
+    width: int | None = None,
 ) -> None:
-    """Prints a table of quantities, their values and units."""
-    justify = {"quantity": "left", "joint": "left", "unit": "left"}
+    """Prints a table of quantities, their values and units, `width` columns wide (default: the terminal's)."""
+    justify = {"quantity": "left", "joint": "left", "unit": "left", "status": "left"}
     table = Table(*(Column(column, justify=justify.get(column, "right")) for column in columns), title=title)  # type: ignore
     for row in rows:
         table.add_row(*row)
-    Console(highlight=False, soft_wrap=True).print(table)
+    Console(highlight=False, soft_wrap=True, width=width).print(table)

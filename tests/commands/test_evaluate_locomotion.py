@@ -9,10 +9,10 @@ import pytest
 from calls import assert_refused, command, json_of, one_line
 
 from dln_jax.commands import evaluate_locomotion, train_locomotion
+from dln_jax.commands.locomotion.policies import judge, load_policy
 from dln_jax.locomotion.learning import make_policy
 from dln_jax.locomotion.perturbed import Trials, numbers_of
 from dln_jax.locomotion.task import creature_named, make_task
-from dln_jax.training.locomotion_evaluation import judge, load_policy
 from dln_jax.zoo.parameter_files import save_tree
 
 STEPS = 10
@@ -59,8 +59,7 @@ def test_uphill_and_downhill_are_counted_apart_and_an_episode_that_fails_to_conv
 def test_a_policy_of_another_shape_is_not_trained_further(run, capsys, tmp_path):
     rows = {
         "--creature biped --width 5": "has creature crawler, not biped; give --creature crawler",
-        "--width 6 --clock-period 9": "has width 5, not 6; give --width 5",
-        "--width 5": "has clock-period 9.0, not 16.0; give --clock-period 9.0",
+        "--width 6": "has width 5, not 6; give --width 5",
     }
     assert_refused(capsys, train_locomotion, rows.items(), "--stored", run, out=tmp_path / "out")
 

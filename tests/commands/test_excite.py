@@ -62,7 +62,6 @@ def test_bad_input_is_one_line(arm, tmp_path, capsys):
         ("--harmonics 1", "harmonics is 1"),
         ("--harmonics 40 --rate 4", "half the sampling rate"),
         ("--robot nowhere.urdf", "nowhere.urdf"),
-        ("--criterion best", "criterion"),
         ("--velocity 1,2,3", "--velocity is '1,2,3'; expected 1 or 2 positive numbers"),
         ("--torque strong", "--torque is 'strong'"),
         ("--share 2", "share is 2"),

@@ -41,8 +41,6 @@ ROBOT = """<robot name="r"><link name="b"/><link name="l"><inertial><mass value=
 DIGITS = "9" * 5000
 OPTIONS = {
     make_data: [
-        "--scene pendulum --kind uniform --position-bound inf",
-        "--scene pendulum --kind uniform --rate-bound nan",
         "--scene pendulum --kind uniform --seed -1",
         "--scene pendulum --kind uniform --samples 10000000000",
         "--scene pendulum --kind free-swing --dt inf",

@@ -223,10 +223,8 @@ def test_mistakes_are_one_line(capsys, tmp_path):
     rows = [
         ("--steps 0", "steps is 0"),
         ("--upright -1", "--upright is -1"),
-        ("--clock-period -1", "--clock-period is -1"),
         ("--resume", "holds none"),
         ("--window 0", "window is 0"),
-        ("--lanes 0", "lanes is 0"),
         ("--slope 90", "slope is 90"),
         ("--push nan", "push is nan"),
         ("--seed -1", "seed is -1"),

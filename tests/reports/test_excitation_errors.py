@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from dln_jax.identification.excitation.candidates import measured, random_designs
+from dln_jax.identification.excitation.design import assess, random_designs
 from dln_jax.identification.excitation.limits import MotionLimits
 from dln_jax.identification.excitation.task import make_task
 from dln_jax.mechanics.trees.description import dh_frames, serial
@@ -24,7 +24,7 @@ def test_a_wider_motion_errs_less_and_the_same_not_at_all():
     assert (error_ratios(wide, wide, seeds=4) == 1.0).all()
     # Half as far: a sixteenth of the information of some parameters.
     narrow = [
-        measured(task, design.motion._replace(coefficients=0.5 * np.asarray(design.motion.coefficients)))
+        assess(task, design.motion._replace(coefficients=0.5 * np.asarray(design.motion.coefficients)))
         for design in wide
     ]
     ratios = error_ratios(wide, narrow, seeds=20)

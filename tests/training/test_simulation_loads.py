@@ -7,10 +7,9 @@ import pytest
 from calls import one_line
 
 from dln_jax.commands.simulate import Arguments
+from dln_jax.commands.simulations import scenes
 from dln_jax.softbody.mesh.shapes import lattice
 from dln_jax.softbody.scene import make_scene, prepare
-from dln_jax.training.simulation import example_of
-from dln_jax.training.simulation_meshes import own_mesh
 
 
 @pytest.fixture
@@ -26,7 +25,7 @@ def options(path, **given_options):
 
 
 def test_a_pressure_acts_in_the_closed_cavity(path):
-    choices, _ = own_mesh(options(path, pressure="inner=2e4"), 1e6)
+    choices, _ = scenes.own_mesh(options(path, pressure="inner=2e4"), 1e6)
     mesh = choices["mesh"]
     (term,) = choices["loads"](mesh)
     scene = make_scene(mesh, [term])
@@ -36,18 +35,18 @@ def test_a_pressure_acts_in_the_closed_cavity(path):
 
 def test_a_scene_that_holds_nothing_says_that_it_does_not_use_the_held_vertices_of_a_file(path):
     np.savez(path, **np.load(path), held=[0, 1])
-    _, statements = example_of(Arguments(scene="drop", mesh=path))
-    assert any("`held` is not used" in line for line in statements)
+    found = scenes.prepare(Arguments(mesh=path), "drop")
+    assert any("`held` is not used" in line for line in found.statements)
 
 
 def test_a_mistake_is_one_line(path):
     for option, value, message in (
         ("pressure", "bag=2", "--mesh the mesh has no set 'bag'"),
-        ("pressure", "inner", "--pressure is 'inner'; expected SET=PA"),
+        ("pressure", "inner", "--pressure has 'inner', which is no NAME=VALUE"),
         ("pressure", "inner=1,inner=2", "--pressure names 'inner' twice"),
-        ("load", "tip=1,2,3", "--load is 'tip=1,2,3'; expected SET=FX,FY,"),
-        ("load", "tip=1,2; tip=3,4", "--load names 'tip' twice; expected once"),
-        ("load", "tip=0,nan", "--load is"),
+        ("load", "tip=1,2,3", "--load tip is '1,2,3'; expected 2 numbers"),
+        ("load", "tip=1,2; tip=3,4", "--load names 'tip' twice"),
+        ("load", "tip=0,nan", "--load tip is"),
     ):
         with one_line(message):
-            own_mesh(options(path, **{option: value}), 1e6)
+            scenes.own_mesh(options(path, **{option: value}), 1e6)

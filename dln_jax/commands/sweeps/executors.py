@@ -1,7 +1,4 @@
-"""Runs the jobs of a sweep by any executor with futures.
-
-The executors here are contexts that yield the arguments `submit` and `together` of `run`.
-"""
+"""Runs the jobs of a sweep by any executor with futures; the contexts here yield the argument `submit` of `run`."""
 
 import contextlib
 import importlib
@@ -22,40 +19,45 @@ from dln_jax.commands.sweeps.job import SECONDS_BETWEEN_LOOKS, STATUS, Job, run_
 from dln_jax.files import write_json
 from dln_jax.types import InputError
 
-Submit = Callable[[Callable[..., None], Job], Any]
-"""(function, job) -> future with `done()` and `cancel()`, such as `concurrent.futures.ProcessPoolExecutor().submit`."""
-Together = Callable[[], contextlib.AbstractContextManager[Any]]
-"""Context of all submissions."""
+Submit = Callable[[Callable[..., None], Sequence[Job]], Sequence[Any]]
+"""(function, jobs) -> a future for each job, with `done()` and `cancel()`, such as `dask.distributed.Client().map`."""
 MINUTES, TIMEOUTS = 60, 20
 """Time limit of a Slurm job in minutes, and how often submitit requeues a job that reaches it."""
+MOST_IN_ARRAY = 1000
+"""Largest number of jobs in an array, Slurm's default MaxArraySize."""
 
 
 def run(
     jobs: Sequence[Job],
     submit: Submit,
-    together: Together = contextlib.nullcontext,
     report: Callable[[int, int], None] = lambda ended, bad: None,
 ) -> None:
     """Runs jobs until all have ended; records jobs that ended without a status as killed.
 
     Args:
         jobs: the jobs; the executor's processes must see their folders.
-        together: context of the submissions, for executors that start all jobs at once.
+        submit: starts a function of a job for all jobs.
         report: called with the number of jobs that have ended, and how many of these are not done.
     """
     for job in jobs:
         job.folder.mkdir(parents=True, exist_ok=True)
         write_json(job.folder / STATUS, status_of(job.folder)._replace(state="missing", line="")._asdict())
-    with together():
-        waiting = [(job, submit(run_job, job)) for job in jobs]
-    bad = 0
+    waiting, bad = list(zip(jobs, submit(run_job, jobs), strict=True)), 0
     try:
         while waiting:
             ended = [(job, future) for job, future in waiting if future.done()]
             if not ended:
                 time.sleep(SECONDS_BETWEEN_LOOKS)
             waiting = [pair for pair in waiting if pair not in ended]
-            bad += sum(_final_state(job, future) != "done" for job, future in ended)
+            for job, future in ended:
+                status = status_of(job.folder)
+                if status.state in ("missing", "running"):  # the job has not stored its end
+                    word = getattr(future, "state", "")  # Slurm's state, such as OUT_OF_MEMORY
+                    how = "did not start" if status.state == "missing" else "ended without a word"
+                    line = f"{how} ({word})" if isinstance(word, str) and word else how
+                    status = status._replace(state="killed", line=line)
+                    write_json(job.folder / STATUS, status._asdict())
+                bad += status.state != "done"
             report(len(jobs) - len(waiting), bad)
     except BaseException:
         for _, future in waiting:
@@ -63,19 +65,8 @@ def run(
         raise
 
 
-def _final_state(job: Job, future: Any) -> str:
-    """State of a job whose future is done; a job that has not stored its end is recorded as killed."""
-    status = status_of(job.folder)
-    if status.state in ("missing", "running"):
-        word = getattr(future, "state", "")  # Slurm's state, such as OUT_OF_MEMORY
-        how = "did not start" if status.state == "missing" else "ended without a word"
-        status = status._replace(state="killed", line=f"{how} ({word})" if isinstance(word, str) and word else how)
-        write_json(job.folder / STATUS, status._asdict())
-    return status.state
-
-
 @contextlib.contextmanager
-def here(at_once: int, gpus: int) -> Iterator[tuple[Submit, Together]]:
+def here(at_once: int, gpus: int) -> Iterator[Submit]:
     """Runs jobs as processes of this machine; leaving the context interrupts the ones that still run.
 
     A process gets its share of the cores as XLA threads, one BLAS thread, and one GPU or none, of those that the user's
@@ -103,20 +94,21 @@ def here(at_once: int, gpus: int) -> Iterator[tuple[Submit, Together]]:
 
     pool = ThreadPoolExecutor(at_once)
     try:
-        yield lambda function, job: pool.submit(work, function, job), contextlib.nullcontext
+        yield lambda function, jobs: [pool.submit(work, function, job) for job in jobs]
     finally:
         interrupt.set()
         pool.shutdown(cancel_futures=True)
 
 
 @contextlib.contextmanager
-def slurm(folder: Path, at_once: int | None, options: str) -> Iterator[tuple[Submit, Together]]:
+def slurm(folder: Path, at_once: int | None, options: str, jobs: int) -> Iterator[Submit]:
     """Runs jobs as one array of a Slurm cluster, by submitit.
 
     Args:
         folder: folder of the sweep, which all hosts must see.
         at_once: jobs of the array that run at once; None: as many as Slurm allows.
         options: options of sbatch under submitit's names: "partition=gpu time=60 gpus_per_node=1".
+        jobs: number of jobs.
 
     Raises:
         InputError: Slurm is not installed here or refuses the array, or submitit does not know an option.
@@ -124,23 +116,30 @@ def slurm(folder: Path, at_once: int | None, options: str) -> Iterator[tuple[Sub
     submitit = required("submitit", "sweep")
     if missing := [name for name in ("sbatch", "srun", "sacct", "scancel") if shutil.which(name) is None]:
         raise InputError(f"--where slurm: no {missing[0]} on the PATH; call it on a host of the cluster")
+    if jobs > MOST_IN_ARRAY:
+        raise InputError(f"{jobs} jobs for one Slurm array; expected at most {MOST_IN_ARRAY}; split the grid")
+    parameters: dict[str, Any] = {"job_name": folder.name, "time": MINUTES}
+    parameters |= {} if at_once is None else {"array_parallelism": at_once}
+    for name, value in pairs("--slurm", options).items():
+        number = value.isdecimal() and len(value) < 10
+        if name == "time" and not number:
+            raise InputError(f"--slurm: time is {value!r:.40}; expected whole minutes")
+        parameters[name] = int(value) if number else [value] if name in ("setup", "teardown") else value
     executor = submitit.SlurmExecutor(folder=folder / "submitit", max_num_timeout=TIMEOUTS)
     try:
-        limit = {} if at_once is None else {"array_parallelism": at_once}
-        executor.update_parameters(**{"job_name": folder.name, "time": MINUTES, **limit, **sbatch_options(options)})
+        executor.update_parameters(**parameters)
     except (NameError, TypeError, ValueError, AssertionError) as error:
         raise InputError(f"--slurm: {' '.join(str(error).split())[:300]}") from None
 
-    @contextlib.contextmanager
-    def array() -> Iterator[None]:
+    def submit(function: Callable[..., None], jobs: Sequence[Job]) -> Sequence[Any]:
         try:
-            with contextlib.redirect_stderr(io.StringIO()), executor.batch():  # submitit prints what it raises
-                yield
+            with contextlib.redirect_stderr(io.StringIO()):  # submitit prints what it raises
+                return executor.map_array(Requeued(function), jobs)
         except submitit.core.utils.FailedJobError as error:
             raise InputError(f"--where slurm: {' '.join(str(error).split())[-300:]}") from None
 
     try:
-        yield lambda function, job: executor.submit(Requeued(function), job), array
+        yield submit
     finally:
         # submitit exchanges jobs and results as pickles; nothing reads them again.
         for pickle in (folder / "submitit").glob("*.pkl"):
@@ -164,7 +163,7 @@ class Requeued(NamedTuple):
 
 
 @contextlib.contextmanager
-def ray(at_once: int, gpus: int) -> Iterator[tuple[Submit, Together]]:
+def ray(at_once: int, gpus: int) -> Iterator[Submit]:
     """Runs jobs as Ray tasks, on the cluster of RAY_ADDRESS or on this machine, with one core and at most one GPU."""
     package = required("ray", "ray")
     if os.environ.get("RAY_ADDRESS"):
@@ -175,20 +174,9 @@ def ray(at_once: int, gpus: int) -> Iterator[tuple[Submit, Together]]:
     threads = {"env_vars": {"OPENBLAS_NUM_THREADS": "1", "NPROC": "1"}}
     task = package.remote(num_cpus=1, num_gpus=min(gpus, 1), max_retries=0, runtime_env=threads)
     try:
-        yield lambda function, job: task(function).remote(job).future(), contextlib.nullcontext
+        yield lambda function, jobs: [task(function).remote(job).future() for job in jobs]
     finally:
         package.shutdown()
-
-
-def sbatch_options(text: str) -> dict[str, Any]:
-    """Parses --slurm into submitit's parameters; `InputError` if the time is not in whole minutes."""
-    options: dict[str, Any] = {}
-    for name, value in pairs("--slurm", text).items():
-        number = value.isdecimal() and len(value) < 10
-        if name == "time" and not number:
-            raise InputError(f"--slurm: time is {value!r:.40}; expected whole minutes")
-        options[name] = int(value) if number else [value] if name in ("setup", "teardown") else value
-    return options
 
 
 def cores() -> int:

@@ -12,11 +12,11 @@ import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import get_args, get_type_hints
 
 from dln_jax.commands.sweeps.job import Job
 from dln_jax.errors import InputError
-from dln_jax.runs.arguments import arguments_for, parse
+from dln_jax.runs.arguments import arguments_for, pairs_of, parse
 from dln_jax.runs.options import CompilationCache
 
 RANGE = re.compile(r"(-?\d{1,18}):(-?\d{1,18})(?::(-?\d{1,18}))?")
@@ -33,16 +33,9 @@ def pairs(option: str, text: str) -> dict[str, str]:
         words = shlex.split(text)
     except ValueError as error:
         raise InputError(f"{option} is {text!r:.60}: {str(error).lower()}; close the quotes") from None
-    values: dict[str, str] = {}
-    for word in words:
-        name, equals, value = word.partition("=")
-        name = name.removeprefix("--").replace("-", "_")
-        if not equals or not name.isidentifier() or not value:
-            raise InputError(f"{option} has {word!r:.60}, which is no NAME=VALUE; {EXAMPLE}")
-        if name in values:
-            raise InputError(f"{option} names {name} twice; give all its values at once")
-        values[name] = value
-    return values
+    names = [word.partition("=")[0] for word in words]
+    known = [name.removeprefix("--").replace("-", "_") for name in names]
+    return pairs_of(option, [own + word[len(name) :] for own, name, word in zip(known, names, words, strict=True)])
 
 
 def grid_of(text: str) -> dict[str, tuple[str, ...]]:
@@ -54,34 +47,32 @@ def grid_of(text: str) -> dict[str, tuple[str, ...]]:
     Raises:
         InputError: empty or malformed text, a repeated option or value, an empty range, more than 10,000 combinations.
     """
-    parts = {
-        name: [_values(name, part) for part in values.split(",")] for name, values in pairs("--grid", text).items()
-    }
-    if not parts:
-        raise InputError(f"--grid names no option; {EXAMPLE}")
-    # Counted before the ranges are written out, which could exhaust the memory.
-    if (count := math.prod(sum(map(len, values)) for values in parts.values())) > MOST_JOBS:
-        raise InputError(f"--grid has {count:,} combinations; expected at most {MOST_JOBS:,}; split it into several")
-    grid = {name: tuple(map(str, itertools.chain(*values))) for name, values in parts.items()}
-    for name, values in grid.items():
+    grid: dict[str, tuple[str, ...]] = {}
+    for name, listed in pairs("--grid", text).items():
+        values: list[str] = []
+        for part in listed.split(","):
+            if not part:
+                raise InputError(f"--grid: {name} has an empty value; leave the comma out")
+            if not (numbers := RANGE.fullmatch(part)):
+                values.append(part)
+                continue
+            start, stop, step = int(numbers[1]), int(numbers[2]), int(numbers[3] or 1)
+            if step == 0:
+                raise InputError(f"--grid: {name}={part} has step 0; expected another")
+            if not (span := range(start, stop, step)):
+                raise InputError(f"--grid: {name}={part} is an empty range; its end is not part of it")
+            if len(span) > MOST_JOBS:
+                raise InputError(f"--grid: {name}={part} has {len(span):,} values; expected at most {MOST_JOBS:,}")
+            values += map(str, span)
         value, times = Counter(values).most_common(1)[0]
         if times > 1:
             raise InputError(f"--grid: {name} has {value} twice; give each value once")
+        grid[name] = tuple(values)
+    if not grid:
+        raise InputError(f"--grid names no option; {EXAMPLE}")
+    if (count := math.prod(map(len, grid.values()))) > MOST_JOBS:
+        raise InputError(f"--grid has {count:,} combinations; expected at most {MOST_JOBS:,}; split it into several")
     return grid
-
-
-def _values(name: str, text: str) -> Sequence[str | int]:
-    """One part of an option's values: a word, or a range of whole numbers."""
-    if not text:
-        raise InputError(f"--grid: {name} has an empty value; leave the comma out")
-    if not (parts := RANGE.fullmatch(text)):
-        return [text]
-    start, stop, step = int(parts[1]), int(parts[2]), int(parts[3] or 1)
-    if step == 0:
-        raise InputError(f"--grid: {name}={text} has step 0; expected another")
-    if not (numbers := range(start, stop, step)):
-        raise InputError(f"--grid: {name}={text} is an empty range; its end is not part of it")
-    return numbers
 
 
 def jobs_of(
@@ -96,22 +87,33 @@ def jobs_of(
         InputError: an option that the command lacks or the sweep sets itself, a wrong value, or a missing file.
     """
     # Options that only some choices read, such as a model's, are those of the first job.
-    stated = {**fixed, **{name: texts[0] for name, texts in grid.items()}}
-    whole = arguments_for(arguments, stated)
-    known = [*(field.name for field in dataclasses.fields(whole)), "compilation_cache"]
+    whole = arguments_for(arguments, {**fixed, **{name: texts[0] for name, texts in grid.items()}})
+    hints = get_type_hints(whole)
+    types = {field.name: hints[field.name] for field in dataclasses.fields(whole)} | {"compilation_cache": bool}
     if both := [name for name in grid if name in fixed]:
         raise InputError(f"{both[0]} is in --grid and in --fixed; leave it out of one")
-    if "out" not in known:
+    if "out" not in types:
         raise InputError(f"{command} has no --out, so that it leaves nothing to compare; choose a command that trains")
+
+    def word(source: str, name: str, text: str) -> str:
+        """The command-line word for an option's value."""
+        option = name.replace("_", "-")
+        if bool not in (types[name], *get_args(types[name])):
+            return f"--{option}={text}"
+        if text.lower() not in TRUTH:
+            raise InputError(f"{source}: {name} is {text!r:.40}; expected yes or no")
+        return f"--{option}" if TRUTH[text.lower()] else f"--no-{option}"
+
     options = {name: ("--fixed", (text,)) for name, text in fixed.items()}
     options |= {name: ("--grid", tuple(texts)) for name, texts in grid.items()}
     words: dict[str, dict[str, str]] = {}
     for name, (source, texts) in options.items():
         if name in OF_SWEEPS:
             raise InputError(f"{source} has {name}, which every job gets from the sweep; leave it out")
-        if name not in known:
-            raise InputError(f"{source}: {command} has no option {name}{closest(name, known)} (see {command} --help)")
-        words[name] = {text: _word(whole, source, name, text) for text in texts}
+        if name not in types:
+            like = closest(name, list(types))
+            raise InputError(f"{source}: {command} has no option {name}{like} (see {command} --help)")
+        words[name] = {text: word(source, name, text) for text in texts}
     first = {name: next(iter(by_text.values())) for name, by_text in words.items()}
     prog = f"python -m dln_jax {command}"
     for name, (source, texts) in options.items():
@@ -126,12 +128,12 @@ def jobs_of(
             if isinstance(value, Path) and not value.exists():
                 raise InputError(f"{source}: {name}={text}: no such file or folder")
     # Within an allocation of several tasks, a job would otherwise take itself for one process of a larger run.
-    common = [first[name] for name in fixed] + ["--processes=1"] * ("processes" in known)
+    common = [first[name] for name in fixed] + ["--processes=1"] * ("processes" in types)
     jobs = []
     for number, texts in enumerate(itertools.product(*grid.values())):
         values = dict(zip(grid, texts, strict=True))
         line = (*common, *(words[name][text] for name, text in values.items()))
-        jobs.append(Job(folder / "jobs" / f"{number:04}", command, line, values, "resume" in known, Path.cwd()))
+        jobs.append(Job(folder / "jobs" / f"{number:04}", command, line, values, "resume" in types, Path.cwd()))
     return jobs
 
 
@@ -139,14 +141,3 @@ def closest(word: str, known: Sequence[str]) -> str:
     """ "; did you mean WORD?" for the known word closest to an unknown one, or nothing."""
     like = difflib.get_close_matches(word, known, n=1)
     return f"; did you mean {like[0]}?" if like else ""
-
-
-def _word(arguments: type, source: str, name: str, text: str) -> str:
-    """The command-line word for an option's value; paths become absolute, so that jobs may run anywhere."""
-    hint: Any = get_type_hints(arguments).get(name, bool)
-    option = name.replace("_", "-")
-    if bool in (hint, *get_args(hint)):
-        if text.lower() not in TRUTH:
-            raise InputError(f"{source}: {name} is {text!r:.40}; expected yes or no")
-        return f"--{option}" if TRUTH[text.lower()] else f"--no-{option}"
-    return f"--{option}={Path(text).resolve() if Path in (hint, *get_args(hint)) else text}"

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_type_hints
+from typing import Any, Literal, NamedTuple
 
 from filelock import FileLock
 
@@ -94,7 +94,12 @@ def run_job(job: Job, environment: Mapping[str, str] | None = None, interrupt: t
                 while process.poll() is None and not interrupt.wait(SECONDS_BETWEEN_LOOKS):
                     pass
             finally:
-                _end(process)
+                process.terminate()  # our commands treat it as Ctrl-C; a background process would ignore Ctrl-C itself
+                try:
+                    process.wait(SECONDS_TO_END)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
         state, reason = _outcome(process.returncode, job.folder / OUTPUT, first)
         status = status._replace(state=state, line=reason, seconds=time.monotonic() - began)
         write_json(job.folder / STATUS, status._asdict())
@@ -110,25 +115,13 @@ def status_of(folder: Path) -> Status:
     if not is_file(path):
         return Status("done" if is_file(folder / "run" / METRICS) else "missing")
     stored = read_json(path, remedy=remedy)
-    for name, hint in get_type_hints(Status).items():
-        if name in stored:
-            as_type(stored[name], hint, name=f"{path}: {name}", remedy=remedy)
-    status = Status(**{name: stored[name] for name in Status._fields if name in stored})
+    values = [stored.get(name, default) for name, default in Status._field_defaults.items()]
+    status = as_type(values, Status, name=str(path), remedy=remedy)
     if status.attempt < 0 or not _RUN.fullmatch(status.run) or (folder / status.run).is_symlink():
         raise InputError(f"{path}: attempt {status.attempt}, run '{status.run:.60}' are not those of a job; {remedy}")
     if status.state == "done" and not any((folder / status.run).glob("*")):
         return Status(line="its run is gone", attempt=status.attempt)
     return status
-
-
-def _end(process: subprocess.Popen) -> None:
-    """Interrupts a command that still runs, so that it stores a checkpoint; kills it if it does not end in time."""
-    process.terminate()  # our commands treat it as Ctrl-C; a background process would ignore Ctrl-C itself
-    try:
-        process.wait(SECONDS_TO_END)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
 
 
 def _outcome(code: int, output: Path, first: int) -> tuple[State, str]:

@@ -2,263 +2,178 @@
 
 import csv
 import io
-import math
-from collections.abc import Mapping, Sequence
+import statistics
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
-
-from dln_jax.commands.sweeps.job import METRICS, Job, Status, status_of
-from dln_jax.figures.sweeps import Point, error_against_seconds
+from dln_jax.commands.sweeps.job import METRICS, Job, status_of
 from dln_jax.files import as_type, finite, is_file, read_json, write_bytes, write_json
+from dln_jax.runs.report import print_numbers
 from dln_jax.types import InputError
 
-VALIDATION = ("validation_error", "validation_loss", "validation")
-ERRORS = ("torque_mse", "value_mse", "rollout_mse", "torque_nmse", "down_return_mean")
-SECONDS = ("train_seconds", "learning_seconds", "identify_seconds")
-"""Names of metrics in the commands; of every group the first name that the jobs have counts."""
-PROBLEM = (
-    "creature", "data", "function", "goal", "lock", "needs", "objective", "plant", "robot", "scene", "task", "test",
-)  # fmt: skip
+COMPARED = {
+    "validation": ("validation_error", "validation_loss", "validation"),
+    "error": ("torque_mse", "value_mse", "rollout_mse", "torque_nmse", "down_return_mean"),
+    "train_seconds": ("train_seconds", "learning_seconds", "identify_seconds"),
+}
+"""Metrics that are compared by default: of each kind, the first that the jobs have."""
+PROBLEM = [
+    "creature",
+    "data",
+    "function",
+    "goal",
+    "lock",
+    "needs",
+    "objective",
+    "plant",
+    "robot",
+    "scene",
+    "task",
+    "test",
+]
 """Options that define a problem; errors of different problems are not compared."""
 WIDTH = 200
 """Width of tables in columns. A narrow terminal wraps their lines, since truncated numbers would be useless."""
 MOST_ROWS = 200
-MOST_PANELS = 6
-"""Largest number of problems drawn in panels of their own."""
 
 
-class Entry(NamedTuple):
-    """A job, its status and its metrics."""
-
-    job: Job
-    status: Status
-    metrics: dict[str, Any]
-
-    def number(self, name: str | None) -> float | None:
-        """A metric; `None` if the job lacks it or it is not finite."""
-        value = self.metrics.get(name) if name else None
-        return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
-
-
-class Group(NamedTuple):
-    """Jobs that differ only in the options that medians are taken over."""
-
-    values: dict[str, str]
-    done: int
-    jobs: int
-    medians: dict[str, float]
-    worst: dict[str, float]
-
-
-class Results(NamedTuple):
-    """All jobs of a sweep, compared. A metric's name is `None` if no job has such a metric."""
-
-    entries: list[Entry]
-    metrics: list[str]
-    validation: str | None
-    error: str | None
-    seconds: str | None
-    best: list[Entry]
-    """The job with the best validation for every problem with several jobs; test errors are ignored."""
-    over: tuple[str, ...]
-    """Options that medians are taken over."""
-    groups: list[Group]
-
-    @property
-    def shown(self) -> list[str]:
-        """The metrics in the tables."""
-        return [name for name in (self.validation, self.error, self.seconds) if name]
-
-
-def compared(
+def compare(
     jobs: Sequence[Job],
     over: Sequence[str] = (),
     *,
     metric: str | None = None,
     error: str | None = None,
     largest: bool = False,
-) -> Results:
-    """Compares all jobs.
+) -> dict[str, Any]:
+    """Compares all jobs; returns the contents of sweep.json.
+
+    `jobs` has a row for each job: its values, status and metrics, and whether it is the best of several jobs with the
+    same problem. `groups` has medians and the worst of jobs that differ only in the options `over`. A number is `None`
+    if the job lacks it or it is not finite.
 
     Args:
         over: options that medians are taken over.
-        metric: metric that chooses the best job; default: the first of `VALIDATION` that jobs have.
-        error: metric that is shown beside it; default: the first of `ERRORS`.
+        metric: metric that chooses the best job; default: a validation error.
+        error: metric that is shown beside it; default: a test error.
 
     Raises:
         InputError: jobs have metrics, but none has the requested one.
     """
-    entries = [_entry(job) for job in jobs]
-    metrics = list(dict.fromkeys(name for entry in entries for name in entry.metrics))
+    rows = []
+    for job in jobs:
+        status, metrics = status_of(job.folder), {}
+        path, remedy = job.folder / status.run / METRICS, "remove the job's folder, and --resume"
+        if status.state == "done" and is_file(path):
+            try:
+                metrics = read_json(path, remedy=remedy)
+                metrics = finite(as_type(metrics, dict[str, float | None], name=str(path), remedy=remedy))
+            except InputError as mistake:
+                status, metrics = status._replace(state="failed", line=str(mistake)), {}
+        values = {"job": job.folder.name, "values": dict(job.values), "best": False}
+        rows.append({**values, **status._asdict(), "metrics": metrics})
+    known = list(dict.fromkeys(name for row in rows for name in row["metrics"]))
     for option, name in (("metric", metric), ("error", error)):
-        if metrics and name is not None and name not in metrics:
+        if known and name is not None and name not in known:
             raise InputError(
-                f"--{option}: no job has the metric {name!r:.40}; choose from {', '.join(sorted(metrics))}. Jobs that "
+                f"--{option}: no job has the metric {name!r:.40}; choose from {', '.join(sorted(known))}. Jobs that "
                 f"are done are kept: --resume with another --{option} only makes the table"
             )
-    usual = [next((name for name in names if name in metrics), None) for names in (VALIDATION, ERRORS, SECONDS)]
-    names = (metric or usual[0], error or usual[1], usual[2])
-    choose = max if largest else min
-    best = []
-    for rivals in _classes([entry for entry in entries if entry.number(names[0]) is not None], problem_of):
+    names = {kind: next((name for name in usual if name in known), None) for kind, usual in COMPARED.items()}
+    names |= {kind: name for kind, name in (("validation", metric), ("error", error)) if name is not None}
+    judge = names["validation"]
+    chosen = [row for row in rows if row["metrics"].get(judge) is not None]
+    for rivals in classes(chosen, lambda row: problem_of(row["values"])):
         if len(rivals) > 1:
-            best.append(choose(rivals, key=lambda entry: entry.number(names[0]) or 0.0))
+            (max if largest else min)(rivals, key=lambda row: row["metrics"][judge])["best"] = True
     groups = []
-    for part in _classes(entries, lambda values: [(name, text) for name, text in values.items() if name not in over]):
-        numbers = {name: [n for entry in part if (n := entry.number(name)) is not None] for name in names if name}
-        numbers = {name: values for name, values in numbers.items() if values}
-        medians = {name: float(np.median(values)) for name, values in numbers.items()}
-        worst = {name: (min if largest and name == names[0] else max)(values) for name, values in numbers.items()}
-        values = {name: text for name, text in part[0].job.values.items() if name not in over}
-        groups.append(Group(values, sum(entry.status.state == "done" for entry in part), len(part), medians, worst))
-    return Results(entries, metrics, *names, best, tuple(over), groups)
+    for part in classes(rows, lambda row: [(name, text) for name, text in row["values"].items() if name not in over]):
+        medians, worst = {}, {}
+        for name in filter(None, names.values()):
+            numbers = [number for row in part if (number := row["metrics"].get(name)) is not None]
+            medians[name] = statistics.median(numbers) if numbers else None
+            worst[name] = (min if largest and name == judge else max)(numbers, default=None)
+        values = {name: text for name, text in part[0]["values"].items() if name not in over}
+        done = sum(row["state"] == "done" for row in part)
+        groups.append({"values": values, "done": done, "jobs": len(part), "medians": medians, "worst": worst})
+    return {"names": names, "over": list(over), "metrics": known, "jobs": rows, "groups": groups}
 
 
-def _entry(job: Job) -> Entry:
-    """A job with its status, and metrics if it is done; a job with damaged metrics counts as failed."""
-    status = status_of(job.folder)
-    path = job.folder / status.run / METRICS
-    if status.state != "done" or not is_file(path):
-        return Entry(job, status, {})
-    remedy = "remove the job's folder, and --resume"
-    try:
-        metrics = as_type(read_json(path, remedy=remedy), dict[str, float | None], name=str(path), remedy=remedy)
-        if strange := [name for name in metrics if not name.isidentifier()]:
-            raise InputError(f"{path}: {strange[0]!r:.40} is no name of a metric; {remedy}")
-        return Entry(job, status, metrics)
-    except InputError as error:
-        return Entry(job, status._replace(state="failed", line=str(error)), {})
+def classes(rows: Iterable[dict[str, Any]], key: Callable[[dict[str, Any]], Any]) -> list[list[dict[str, Any]]]:
+    """Rows with the same key, in the order of the rows."""
+    found: dict[Any, list[dict[str, Any]]] = {}
+    for row in rows:
+        found.setdefault(tuple(key(row)), []).append(row)
+    return list(found.values())
 
 
-def _classes(entries: Sequence[Entry], key: Any) -> list[list[Entry]]:
-    """Jobs with the same key of their values, in the order of the jobs."""
-    classes: dict[tuple[Any, ...], list[Entry]] = {}
-    for entry in entries:
-        classes.setdefault(tuple(key(entry.job.values)), []).append(entry)
-    return list(classes.values())
+def problem_of(values: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
+    """The options of a job that define its problem, with their values."""
+    return tuple((name, text) for name, text in values.items() if name in PROBLEM)
 
 
-def problem_of(values: Mapping[str, str]) -> tuple[str, ...]:
-    """The values of a job that define its problem."""
-    return tuple(f"{name} {_short(text)}" for name, text in values.items() if name in PROBLEM)
+def print_results(results: Mapping[str, Any], command: str, folder: Path) -> None:
+    """Prints all jobs, their medians, the best jobs, the jobs that are not done, and the sweep's folder.
 
-
-def print_results(results: Results, command: str, folder: Path) -> None:
-    """Prints all jobs, their medians, the best jobs, the jobs that are not done, and the sweep's folder."""
-    _print_jobs(results, f"{command}, {len(results.entries)} jobs")
-    if results.over:
-        _print_groups(results)
-    if results.metrics and results.validation not in results.metrics:
-        known = ", ".join(sorted(results.metrics))
+    A long sweep shows only the best jobs and the ones that are not done.
+    """
+    rows, over, names = results["jobs"], results["over"], results["names"]
+    best, missed = [row for row in rows if row["best"]], [row for row in rows if row["state"] != "done"]
+    listed, title = rows, f"{command}, {len(rows)} jobs"
+    if len(rows) > MOST_ROWS:
+        listed = [row for row in rows if row["best"] or row["state"] != "done"][:MOST_ROWS]
+        title = f"{title} (the best, and those that are not done; all are in table.csv)"
+    table = []
+    for row in listed:
+        numbers = {name: row["metrics"].get(name) for name in filter(None, names.values())}
+        again = f", attempt {row['attempt']}" if row["attempt"] > 1 else ""
+        status = ("best" if row["best"] else row["state"]) + again
+        table.append({"job": row["job"], **row["values"], **numbers, "status": status})
+    print_rows(title, table)
+    if over:
+        table = []
+        for group in results["groups"]:
+            worst = {
+                f"worst {name}": number for name, number in group["worst"].items() if name != names["train_seconds"]
+            }
+            done = f"{group['done']} of {group['jobs']}"
+            table.append({**group["values"], "done": done, **group["medians"], **worst})
+        print_rows(f"medians over {', '.join(over)}, and the worst", table)
+    if results["metrics"] and names["validation"] is None:
+        known = ", ".join(sorted(results["metrics"]))
         print(f"no job has a validation error: none is chosen; --metric takes one of {known}")
-    for entry in results.best:
-        values = " ".join(f"{name}={text}" for name, text in entry.job.values.items())
-        print(f"best by {results.validation}: {values}, run folder {entry.job.folder / entry.status.run}")
-    if results.best and results.error in ERRORS:
-        print(f"{results.error} is of the test, and took no part in the choice")
-    if unfinished := _unfinished(results):
-        reasons: dict[str, list[str]] = {}
-        for entry in results.entries:
-            if entry.status.state != "done":
-                reasons.setdefault(f"{entry.status.state}: {entry.status.line}", []).append(entry.job.folder.name)
-        print(unfinished, *(f"  {', '.join(names)} {reason}" for reason, names in reasons.items()), sep="\n")
+    for row in best:
+        values = " ".join(f"{name}={text}" for name, text in row["values"].items())
+        print(f"best by {names['validation']}: {values}, run folder {folder / 'jobs' / row['job'] / row['run']}")
+    if best and names["error"] in COMPARED["error"]:
+        print(f"{names['error']} is of the test, and took no part in the choice")
+    if missed:
+        print(unfinished(rows))
+        for part in classes(missed, lambda row: (row["state"], row["line"])):
+            print(f"  {', '.join(row['job'] for row in part)} {part[0]['state']}: {part[0]['line']}")
         print(f"--out {folder} --resume does them again")
     print(f"sweep: {folder}")
 
 
-def _print_jobs(results: Results, title: str) -> None:
-    """Prints a line per job; a long sweep shows only the best jobs and the ones that are not done."""
-    entries = results.entries
-    if len(entries) > MOST_ROWS:
-        entries = [entry for entry in entries if entry in results.best or entry.status.state != "done"][:MOST_ROWS]
-        title = f"{title} (the best, and those that are not done; all are in table.csv)"
-    rows = []
-    for entry in entries:
-        state = "best" if entry in results.best else entry.status.state
-        again = f", attempt {entry.status.attempt}" if entry.status.attempt > 1 else ""
-        numbers = {name: entry.number(name) for name in results.shown}
-        rows.append({"job": entry.job.folder.name, **entry.job.values, **numbers, "status": state + again})
-    _print_rows(title, rows)
+def print_rows(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Prints rows with the same keys as a table; paths are shortened to their last part."""
+    cells = [
+        [f"{cell:.3g}" if isinstance(cell, float | int) else shortened(cell or "") for cell in row.values()]
+        for row in rows
+    ]
+    print_numbers(cells, title=title, columns=[spaced(name) for name in (rows[0] if rows else ())], width=WIDTH)
 
 
-def _print_groups(results: Results) -> None:
-    rows = []
-    for group in results.groups:
-        medians = {name: group.medians.get(name) for name in results.shown}
-        worst = {f"worst_{name}": group.worst.get(name) for name in results.shown if name != results.seconds}
-        rows.append({**group.values, "done": f"{group.done} of {group.jobs}", **medians, **worst})
-    _print_rows(f"medians over {', '.join(results.over)}, and the worst", rows)
-
-
-def _print_rows(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    table = Table(title=title)
-    for name in rows[0] if rows else ():
-        table.add_column(_spaced(name), justify="left" if name == "status" else "right")
+def write_tables(folder: Path, results: Mapping[str, Any]) -> None:
+    """Writes sweep.json, and table.csv with all metrics of every job."""
+    text, rows, metrics = io.StringIO(), results["jobs"], results["metrics"]
+    table = csv.writer(text)
+    table.writerow(map(_cell, ("job", *rows[0]["values"], "status", "line", "best", "attempts", *metrics)))
     for row in rows:
-        table.add_row(*(_short(cell or "") if not isinstance(cell, float) else f"{cell:.3g}" for cell in row.values()))
-    Console(highlight=False, soft_wrap=True, width=WIDTH).print(table)
-
-
-def write_tables(folder: Path, results: Results, **facts: Any) -> None:
-    """Writes sweep.json, with `facts` about the sweep, and table.csv with all metrics of every job."""
-    text = io.StringIO()
-    rows, jobs = csv.writer(text), []
-    rows.writerow(["job", *results.entries[0].job.values, "status", "line", "best", "attempts", *results.metrics])
-    for entry in results.entries:
-        name, values, status, best = entry.job.folder.name, entry.job.values, entry.status, entry in results.best
-        numbers = [finite(entry.metrics.get(metric)) for metric in results.metrics]
-        texts = map(_cell, (*values.values(), status.state, status.line))
-        rows.writerow([name, *texts, int(best), status.attempt, *numbers])
-        kinds = {"validation": results.validation, "error": results.error, "train_seconds": results.seconds}
-        metrics = {kind: entry.number(metric) for kind, metric in kinds.items()}
-        jobs.append({"job": name, "values": values, **status._asdict(), **metrics, "best": best})
+        texts = map(_cell, (*row["values"].values(), row["state"], row["line"]))
+        table.writerow([row["job"], *texts, int(row["best"]), row["attempt"], *map(row["metrics"].get, metrics)])
     write_bytes(folder / "table.csv", text.getvalue().encode())
-    names = {"validation": results.validation, "error": results.error, "seconds": results.seconds}
-    groups = [group._asdict() for group in results.groups]
-    write_json(folder / "sweep.json", {**facts, "names": names, "jobs": jobs, "groups": groups})
-
-
-def drawn(results: Results, *, at_once: int | None) -> Figure | None:
-    """Draws test error against training time, `at_once` jobs at once; `None` if no job has both."""
-    entries, seconds, error = results.entries, results.seconds, results.error
-    if seconds is None or error is None:
-        return None
-    problems = {problem_of(entry.job.values) for entry in entries}
-    panels = len(problems) <= MOST_PANELS and len(entries) > len(problems)
-    options = entries[0].job.values
-    by_look = [name for name in options if name not in (*results.over, *(PROBLEM if panels else ()))]
-    colour, marker = (*by_look, "", "")[:2]
-
-    def points(values: Mapping[str, str], x: float | None, y: float | None, **flags: bool) -> list[Point]:
-        looks = [_short(values[name]) if name else "" for name in (colour, marker)]
-        problem = ", ".join(problem_of(values)) if panels else ""
-        return [] if x is None or y is None else [Point(x, y, *looks, problem=problem, **flags)]
-
-    shown = []
-    for entry in entries:
-        shown += points(entry.job.values, entry.number(seconds), entry.number(error), best=entry in results.best)
-    for group in results.groups if set(results.over) & set(options) else ():
-        shown += points(group.values, group.medians.get(seconds), group.medians.get(error), median=True)
-    if not shown:
-        return None
-    beside = "" if at_once is None else f", {at_once} jobs at once" if at_once > 1 else ", one job at a time"
-    x = f"{seconds.removesuffix('_seconds').replace('train', 'training')}, s{beside}"
-    y = "test " * (error in ERRORS) + _spaced(error)
-    return error_against_seconds(
-        shown, x=x, y=y, colour=_spaced(colour), marker=_spaced(marker), note=_unfinished(results)
-    )
-
-
-def _unfinished(results: Results) -> str:
-    """Counts of the jobs that are not done, by state; empty if all are done."""
-    states = [entry.status.state for entry in results.entries if entry.status.state != "done"]
-    counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
-    return f"{len(results.entries)} jobs: {counts}" if states else ""
+    write_json(folder / "sweep.json", results)
 
 
 def _cell(text: str) -> str:
@@ -270,10 +185,18 @@ def _cell(text: str) -> str:
     return text
 
 
-def _short(text: str) -> str:
+def unfinished(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Counts of the jobs that are not done, by state; empty if all are done."""
+    states = [row["state"] for row in rows if row["state"] != "done"]
+    counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
+    return f"{len(rows)} jobs: {counts}" if states else ""
+
+
+def shortened(text: str) -> str:
     """A value for a table; a path is shortened to its last part."""
-    return Path(text).name if "/" in text else text
+    return text.rstrip("/").rpartition("/")[2]
 
 
-def _spaced(name: str) -> str:
-    return " ".join(word.upper() if word in ("mse", "nmse") else word for word in name.split("_"))
+def spaced(name: str) -> str:
+    """A metric or an option in words."""
+    return name.replace("_", " ").replace("mse", "MSE")

@@ -6,12 +6,12 @@ The unknowns are the joints' Fourier coefficients. The criterion is a function o
     condition      largest over smallest singular value of the regressor with columns of unit length
 
 Every limit at every sample is an inequality constraint of an augmented Lagrangian. Both criteria have many local
-minima, so several random starts are optimised. The result keeps the limits at ten times as many samples; a motion that
-does not is designed again with a larger margin or shrunk.
+minima, so several random starts are optimised. A motion is checked at ten times as many samples as it is designed at,
+and keeps a margin for the times between; one that exceeds a limit is designed again with a larger margin or shrunk.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,32 +19,150 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.identification.excitation.candidates import (
-    MARGIN,
-    Design,
-    functions_at,
-    furthest,
-    grid,
-    kept,
-    states,
-    weighted,
+from dln_jax.identification.excitation.fourier import (
+    FourierMotion,
+    harmonic_functions,
+    require_sampling,
+    rest_basis,
+    sample,
 )
-from dln_jax.identification.excitation.fourier import FourierMotion, require_sampling, rest_basis, sampled
+from dln_jax.identification.excitation.limits import worst
 from dln_jax.identification.excitation.task import Task
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers.augmented_lagrangian import make_minimiser
-from dln_jax.types import InputError, Needs, Scalar, require_positive
+from dln_jax.types import InputError, Needs, Scalar, require_positive, require_seed
 
 SHARPNESS = 4
 """Exponent of the power means that approximate the largest and the smallest eigenvalue."""
 FIRST_MARGIN, TIGHTENINGS = 0.01, 3
 """Initial margin to the limits, relative to them, for excursions between samples; and the number of designs, with a
 larger margin after each that exceeds the limits."""
+FINER = 10
+"""Refinement of the time grid for checking motions."""
+MARGIN = 1e-3
+"""Margin kept to every limit at the checked samples (relative; m for clearances) to cover the times between them."""
+DRAWS = 50
+"""Drawing stops after this number of failed draws per motion found."""
+SMALLEST, BISECTIONS = 0.05, 8
+"""Smallest amplitude of a shrunk motion, relative to the original, and the number of bisection steps."""
 Criterion = Callable[[Array], Array]
 """A [B, B] -> scalar to minimise."""
-Optimiser = Callable[[Design, Any], Design | None]
-"""(start, information already available [B, B]) -> design within the limits, or `None` if there is none."""
+
+
+class Design(NamedTuple):
+    """A motion within the limits, and how informative it is."""
+
+    motion: FourierMotion
+    information: Float[np.ndarray, "B B"]
+    """A, averaged over samples."""
+    condition: float
+    """Condition of the regressor of base parameters with columns of unit length."""
+    log_determinant: float
+    """log det A."""
+    slack: float
+    """Smallest relative distance to a limit."""
+    nearest: str
+    """Limit with the smallest distance."""
+
+
+def functions_at(task: Task, finer: int = 1) -> list[np.ndarray]:
+    """Harmonic functions and their first two derivatives, [N, 2 H] each, on the design grid refined by a factor."""
+    t = task.period * np.arange(finer * task.steps) / (finer * task.steps)
+    return [*map(np.asarray, jax.vmap(lambda t: harmonic_functions(task.harmonics, task.period, t))(t))]
+
+
+def states(functions: list[np.ndarray], offset: Any, coefficients: Any) -> tuple[Any, Any, Any]:
+    """q, qd, qdd [N, d]."""
+    q, qd, qdd = (values @ jnp.asarray(coefficients).T for values in functions)
+    return offset + q, qd, qdd
+
+
+def furthest(task: Task, motion: FourierMotion) -> tuple[float, str]:
+    """The largest excess on the fine grid, and the name of that limit."""
+    motions = states(functions_at(task, FINER), motion.offset, motion.coefficients)
+    parts = zip(*(np.split(np.asarray(array), FINER) for array in motions), strict=True)
+    return max(worst(task.samples(*part)[2]) for part in parts)
+
+
+def shrink_to_limits(task: Task, motion: FourierMotion) -> tuple[Design | None, str]:
+    """Shrinks a motion towards its mean posture until it keeps the limits; `None` if even the smallest breaks them.
+
+    The second result is the limit broken at the smallest amplitude, as text.
+    """
+
+    def shrunk(amplitude: float) -> FourierMotion:
+        return motion._replace(coefficients=amplitude * np.asarray(motion.coefficients))
+
+    beyond, _ = furthest(task, motion)
+    if beyond <= -MARGIN:
+        return assess(task, motion), ""
+    beyond, kind = furthest(task, shrunk(SMALLEST))
+    if beyond > -MARGIN:
+        return None, f"{kind} by {100 * beyond:.2g} %" if kind != "clearance" else f"clearance by {beyond:.2g} m"
+    amplitude, broken = SMALLEST, 1.0
+    for _ in range(BISECTIONS):
+        middle = (amplitude + broken) / 2
+        if furthest(task, shrunk(middle))[0] <= -MARGIN:
+            amplitude = middle
+        else:
+            broken = middle
+    return assess(task, shrunk(amplitude)), ""
+
+
+def weighted(task: Task, Phi: Any) -> Any:
+    """Regressor of the base parameters with rows divided by the joint's noise: [N, d, P] -> [N, d, B]."""
+    return Phi[..., task.columns] / task.noise[:, None]
+
+
+def assess(task: Task, motion: FourierMotion) -> Design:
+    """Computes information, condition and slack of a motion."""
+    at = states(functions_at(task), motion.offset, motion.coefficients)
+    W = weighted(task, np.asarray(task.samples(*at)[0])).reshape(-1, task.columns.size)
+    lengths = np.linalg.norm(W, axis=0)
+    sizes = np.linalg.svd(W / np.where(lengths > 0, lengths, 1.0), compute_uv=False)
+    with np.errstate(divide="ignore"):
+        logarithm = 2 * np.sum(np.log(sizes)) + 2 * np.sum(np.log(lengths)) - len(sizes) * np.log(task.steps)
+    beyond, kind = furthest(task, motion)
+    condition = float(sizes[0] / sizes[-1]) if sizes[-1] > 0 else np.inf
+    return Design(motion, W.T @ W / task.steps, condition, float(logarithm), -beyond, kind)
+
+
+def random_designs(task: Task, count: int, *, seed: int = 0) -> list[Design]:
+    """Draws random motions, with every joint scaled to its limits and the whole motion to those of force and clearance.
+
+    Raises:
+        InputError: too few draws are within the limits (50 failures per motion found); the message names the limit.
+    """
+    require_positive(count=count)
+    require_seed(seed)
+    random, limits, basis = np.random.default_rng(seed), task.limits, rest_basis(task.harmonics)
+    functions = functions_at(task, FINER)
+    lower, upper = limits.position.T
+    # Dividing by the order gives all harmonics the same velocity.
+    spectrum = 1 / np.tile(np.arange(1, task.harmonics + 1), 2)
+    designs, failed = [], 0
+    while len(designs) < count:
+        coefficients = random.normal(size=(len(lower), 2 * task.harmonics)) * spectrum @ basis @ basis.T
+        q, qd, qdd = (values @ coefficients.T for values in functions)
+        sizes = [np.ptp(q, axis=0) / (upper - lower)]
+        sizes += [abs(rate).max(axis=0) / bound for rate, bound in ((qd, limits.velocity), (qdd, limits.acceleration))]
+        scale = (1 - 2 * MARGIN) / np.max(sizes, axis=0)
+        free = (upper - lower) - scale * np.ptp(q, axis=0)
+        offset = lower - scale * q.min(axis=0) + free * random.uniform(0.1, 0.9, len(lower))
+        motion = FourierMotion(offset, scale[:, None] * coefficients, task.period)
+        design, broken = shrink_to_limits(task, motion)
+        if design is not None:
+            designs.append(design)
+        elif (failed := failed + 1) >= DRAWS * max(1, len(designs)):
+            raise InputError(
+                f"{failed} random motions broke the limits even when small, the last of {broken}; widen it"
+            )
+    return designs
+
+
+Designer = Callable[..., Design]
+"""(starts, information already available [B, B] or `None`) -> the best design within the limits."""
 
 
 def _scaled(A: Float[Array, "B B"]) -> tuple[Float[Array, "B B"], Float[Array, " B"]]:
@@ -69,15 +187,15 @@ def condition(A: Float[Array, "B B"]) -> Scalar:
 CRITERIA: dict[str, Criterion] = {"information": information, "condition": condition}
 
 
-def make_optimiser(task: Task, criterion: Criterion, *, rounds: int = 8, iterations: int = 60) -> Optimiser:
-    """Makes an optimiser that is compiled once for all starts.
+def make_designer(task: Task, criterion: Criterion, *, rounds: int = 8, iterations: int = 60) -> Designer:
+    """Makes a function that optimises starts and returns the best design, the starts included; it compiles once.
 
     Args:
         criterion: function of the information, such as one of `CRITERIA`.
         rounds: upper limit of rounds of the augmented Lagrangian.
         iterations: L-BFGS iterations per round.
     """
-    functions, basis = functions_at(task, grid(task)), rest_basis(task.harmonics)
+    functions, basis = functions_at(task), rest_basis(task.harmonics)
     middle, half = task.limits.position.mean(axis=1), np.diff(task.limits.position, axis=1)[:, 0] / 2
 
     def series(x: Any) -> tuple[Any, Any]:
@@ -94,11 +212,10 @@ def make_optimiser(task: Task, criterion: Criterion, *, rounds: int = 8, iterati
 
     minimise = make_minimiser(problem, rounds=rounds, iterations=iterations)
 
-    def optimise(start: Design, known: Any = None) -> Design | None:
+    def optimised(start: Design, known: np.ndarray) -> Design | None:
         motion, margin = start.motion, FIRST_MARGIN
         posture = (np.asarray(motion.offset) - middle) / half
         x = np.column_stack([posture, np.asarray(motion.coefficients) / half[:, None] @ basis]).ravel()
-        known = np.zeros_like(start.information) if known is None else np.asarray(known)
         for _ in range(TIGHTENINGS):
             x = minimise(x, known, margin).x
             offset, coefficients = series(x)
@@ -107,34 +224,21 @@ def make_optimiser(task: Task, criterion: Criterion, *, rounds: int = 8, iterati
             if beyond <= -MARGIN:
                 break
             margin += beyond + 2 * MARGIN
-        return kept(task, motion)[0]
+        return shrink_to_limits(task, motion)[0]
 
-    return optimise
+    def best(starts: Sequence[Design], known: Any = None) -> Design:
+        if not starts:
+            raise InputError("there are no starts; expected at least one design")
+        known = np.zeros_like(starts[0].information) if known is None else np.asarray(known)
 
+        def worth(design: Design) -> float:
+            value = float(criterion(jnp.asarray(known + design.information)))
+            return value if np.isfinite(value) else np.inf
 
-def best_design(
-    task: Task, optimise: Optimiser, criterion: Criterion, starts: Sequence[Design], *, known: Any = None
-) -> Design:
-    """The best design among the optimised starts and the starts themselves.
+        designs = [design for start in starts if (design := optimised(start, known)) is not None]
+        return min([*designs, *starts], key=worth)
 
-    Args:
-        optimise: from `make_optimiser`, for the same task and criterion.
-        starts: such as `random_designs`.
-        known: information already available from other motions [B, B].
-
-    Raises:
-        InputError: no starts.
-    """
-    if not starts:
-        raise InputError("there are no starts; expected at least one design")
-    optimised = [design for start in starts if (design := optimise(start, known)) is not None]
-
-    def worth(design: Design) -> float:
-        A = design.information if known is None else known + design.information
-        value = float(criterion(jnp.asarray(A)))
-        return value if np.isfinite(value) else np.inf
-
-    return min([*optimised, *starts], key=worth)
+    return best
 
 
 def design_set(
@@ -161,13 +265,12 @@ def design_set(
     starts = len(drawn) // (trajectories + 1)
     if not starts:
         raise InputError(f"{len(drawn)} starts are fewer than the {trajectories + 1} motions; expected one for each")
-    judge = CRITERIA[criterion]
-    optimise = make_optimiser(task, judge)
+    best = make_designer(task, CRITERIA[criterion])
     designs: list[Design] = []
     for place in range(trajectories + 1):
         own = drawn[place * starts : (place + 1) * starts]
         known = sum(design.information for design in designs) if 0 < place < trajectories else None
-        designs.append(best_design(task, optimise, judge, own, known=known))
+        designs.append(best(own, known))
         say(place + 1, f"condition {designs[-1].condition:.3g}")
     return designs[:-1], designs[-1]
 
@@ -200,11 +303,10 @@ def as_trajectories(
         InputError: the rate is too low for the harmonics.
     """
     motions = [design.motion for design in designs]
-    for motion in motions:
-        require_sampling(period=motion.period, harmonics=motion.harmonics, rate=rate)
     period = motions[0].period
+    require_sampling(period=period, harmonics=motions[0].harmonics, rate=rate)
     t = np.linspace(0.0, period, round(period * rate) + 1)
-    q, qd, qdd = map(np.concatenate, zip(*(sampled(motion, t) for motion in motions), strict=True))
+    q, qd, qdd = map(np.concatenate, zip(*(sample(motion, t) for motion in motions), strict=True))
     force = jax.jit(jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics))
     index = np.repeat(np.arange(len(motions)), len(t))
     states = {"q": q, "qd": qd, "qdd": qdd, "tau": np.asarray(force(q, qd, qdd))}

@@ -45,7 +45,7 @@ def state(motion: FourierMotion, t: Scalar | float) -> tuple[Vector, Vector, Vec
     return motion.offset + q, qd, qdd
 
 
-def sampled(motion: FourierMotion, t: Any) -> tuple[Float[Array, "N d"], Float[Array, "N d"], Float[Array, "N d"]]:
+def sample(motion: FourierMotion, t: Any) -> tuple[Float[Array, "N d"], Float[Array, "N d"], Float[Array, "N d"]]:
     """q, qd and qdd at the times t [N], s."""
     return jax.vmap(lambda time: state(motion, time))(jnp.asarray(t))
 

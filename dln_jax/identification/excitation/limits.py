@@ -144,7 +144,7 @@ def heights_above(tree: Tree, height: float) -> Clearance | None:
     return (lambda q: world_frames(tree, q)[1][rising, 2] - height) if rising.any() else None
 
 
-def used(limits: MotionLimits, share: float) -> MotionLimits:
+def scale_limits(limits: MotionLimits, share: float) -> MotionLimits:
     """Limits reduced to a share in (0, 1], else `InputError`; ranges shrink towards their middles."""
     if not 0 < share <= 1:
         raise InputError(f"share is {share}; expected a number in (0, 1], of the limits that may be used")

@@ -19,8 +19,7 @@ from dln_jax import Trajectories, Tree, joint_dissipation, tree_system
 from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import every, select
-from dln_jax.identification.excitation.candidates import Design, random_designs
-from dln_jax.identification.excitation.design import CRITERIA, best_design, make_optimiser
+from dln_jax.identification.excitation.design import CRITERIA, Design, make_designer, random_designs
 from dln_jax.identification.excitation.limits import MotionLimits
 from dln_jax.identification.excitation.task import make_task
 from dln_jax.identification.identify import identify, parameters_of
@@ -225,8 +224,8 @@ def excitation(*, joints: int = 7, designs: int = 6, draws: int = 60) -> Numbers
     drawn, starts = random_designs(task, designs), random_designs(task, designs, seed=1)
     numbers = {"excitation/random": {"condition_median": np.median([design.condition for design in drawn])}}
     for name, criterion in CRITERIA.items():
-        optimise = make_optimiser(task, criterion)
-        designed = [best_design(task, optimise, criterion, [start]) for start in starts]
+        best = make_designer(task, criterion)
+        designed = [best([start]) for start in starts]
         ratios = error_ratios(designed, drawn, seeds=draws)
         numbers[f"excitation/{name}"] = {
             "condition_median": np.median([design.condition for design in designed]),

@@ -58,7 +58,7 @@ def test_options_of_sbatch_are_checked(cluster, tmp_path, capsys):
     rows = [
         ("--slurm partion=gpu", "partion"),
         ("--slurm time", "no NAME=VALUE"),
-        ("--slurm", "time=5 time=6", "names time twice"),
+        ("--slurm", "time=5 time=6", "names 'time' twice"),
         ("--slurm time=1-00:00", "whole minutes"),
         # Larger than Slurm's arrays.
         ("--grid seed=0:1001", "1001 jobs for one Slurm array"),

@@ -17,10 +17,9 @@ import pytest
 from calls import assert_refused, command, exit_status, json_of, one_line, refused
 
 from dln_jax.commands import sweep
-from dln_jax.commands.sweeps import command as sweep_command
-from dln_jax.commands.sweeps.executors import here
+from dln_jax.commands.sweeps import executors
 from dln_jax.commands.sweeps.job import Job, Status, run_job, status_of
-from dln_jax.commands.sweeps.table import compared, write_tables
+from dln_jax.commands.sweeps.table import compare, write_tables
 from dln_jax.data import schema
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.registry import scene_named
@@ -50,8 +49,9 @@ def trained(job, resumed):
 
 
 def use(monkeypatch, submit):
-    """Lets the command submit its jobs to this function in place of processes."""
-    monkeypatch.setattr(sweep_command, "here", lambda *_: contextlib.nullcontext((submit, contextlib.nullcontext)))
+    """Lets the command submit each job to this function in place of processes."""
+    together = contextlib.nullcontext(lambda function, jobs: [submit(function, job) for job in jobs])
+    monkeypatch.setattr(executors, "here", lambda *_: together)
 
 
 @pytest.fixture
@@ -147,8 +147,8 @@ def test_a_table_holds_no_formula_and_no_metric_that_is_none(tmp_path):
     for job, metrics in zip(jobs, ('{"torque_mse": 1.0}', '{"=cmd": 1.0}', '{"torque_mse": "=1"}'), strict=True):
         (job.folder / "run").mkdir(parents=True)
         (job.folder / "run/metrics.json").write_text(metrics)
-    results = compared(jobs)
-    assert [entry.status.state for entry in results.entries] == ["done", "failed", "failed"]
+    results = compare(jobs)
+    assert [row["state"] for row in results["jobs"]] == ["done", "done", "failed"]
     write_tables(tmp_path, results)
     text = (tmp_path / "table.csv").read_text()
     assert text.count("'=1+1,-1") == 3 and ",=" not in text
@@ -201,8 +201,8 @@ def test_an_interrupt_cancels_the_jobs(tmp_path, monkeypatch, capsys):
 def test_an_interrupt_ends_the_processes_of_this_machine(tmp_path):
     """Jobs that have not begun never start."""
     first, second = (Job(tmp_path / name, "train_delan", (), {}, resumes=True, directory=tmp_path) for name in "ab")
-    with pytest.raises(KeyboardInterrupt), here(1, 0) as (submit, _):
-        futures = [submit(run_job, job) for job in (first, second)]
+    with pytest.raises(KeyboardInterrupt), executors.here(1, 0) as submit:
+        futures = submit(run_job, (first, second))
         until = time.monotonic() + 60
         while status_of(first.folder).state != "running" and time.monotonic() < until:
             time.sleep(0.01)
@@ -222,12 +222,12 @@ def test_jobs_get_the_gpus_that_the_user_has_made_visible(monkeypatch, tmp_path)
             together.wait()  # both run at once, each with a GPU of its own
 
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-        with here(2, 2) as (submit, _):
-            for future in [submit(wait_for_the_other, job) for job in jobs]:
+        with executors.here(2, 2) as submit:
+            for future in submit(wait_for_the_other, jobs):
                 future.result()
         assert devices == expected
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
-    with one_line("names 1 of them: 3"), here(2, 2):
+    with one_line("names 1 of them: 3"), executors.here(2, 2):
         pass
 
 
@@ -238,7 +238,7 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys, monkeypatch):
         "--command train_delen --grid width=8": "did you mean train_delan?",
         "--command sweep --grid width=8": "there is no 'sweep'",
         "--command make_data --grid seed=0:2": "make_data",
-        "--grid width=8 --over seed": "'seed' is not in --grid",
+        "--grid width=8 --over seed": "'seed' is unknown",
         "--grid width=8 --jobs 0": "jobs is 0",
         "--grid width=8 --jobs 4 --gpus 2": "each job has one",
         "--grid width=8 --where slurm": "no sbatch on the PATH",

@@ -28,7 +28,7 @@ MISTAKES = {
     "seed=3:3": "empty range",
     "seed=0:3:0": "step 0",
     "seed=1,0:3": "seed has 1 twice",
-    "seed=1 width=8 seed=2": "names seed twice",
+    "seed=1 width=8 seed=2": "names 'seed' twice",
     "seed=0:10001": "at most 10,000",
     "seed=0:101 width=0:100": "10,100 combinations",
     "widht=8": r"no option widht; did you mean width\?",

@@ -6,18 +6,20 @@ import numpy as np
 import pytest
 from planar_arm import ARM as LEVEL
 
-from dln_jax.identification.excitation.candidates import FINER, functions_at, grid, random_designs, states
 from dln_jax.identification.excitation.design import (
     CRITERIA,
+    FINER,
     as_trajectories,
-    best_design,
     design_set,
     error_ratio,
-    make_optimiser,
+    functions_at,
+    make_designer,
+    random_designs,
+    states,
     together,
 )
-from dln_jax.identification.excitation.fourier import require_sampling, sampled, state
-from dln_jax.identification.excitation.limits import MotionLimits, heights_above, used, worst
+from dln_jax.identification.excitation.fourier import require_sampling, sample, state
+from dln_jax.identification.excitation.limits import MotionLimits, heights_above, scale_limits, worst
 from dln_jax.identification.excitation.task import independent_columns, linear_force, make_task
 from dln_jax.learning.linear import fit_linear, linearised
 from dln_jax.mechanics.equations import dynamics
@@ -65,7 +67,7 @@ def informative(designs):
 
 def test_the_condition_falls(task, candidates):
     judge = CRITERIA["condition"]
-    conditioned = best_design(task, make_optimiser(task, judge, rounds=6, iterations=40), judge, candidates[:2])
+    conditioned = make_designer(task, judge, rounds=6, iterations=40)(candidates[:2])
     assert conditioned.condition < 0.75 * np.median([design.condition for design in candidates])
 
 
@@ -79,7 +81,7 @@ def test_the_information_rises(candidates, informative):
 
 def test_limits_hold_at_ten_times_the_samples_that_were_checked(task, informative):
     motion = informative.motion
-    q, qd, qdd = states(functions_at(task, grid(task, 10 * FINER)), motion.offset, motion.coefficients)
+    q, qd, qdd = states(functions_at(task, 10 * FINER), motion.offset, motion.coefficients)
     assert np.all(q >= LIMITS.position[:, 0]) and np.all(q <= LIMITS.position[:, 1])
     assert np.all(abs(qd) <= LIMITS.velocity) and np.all(abs(qdd) <= LIMITS.acceleration)
     inverse = dynamics(MODEL.energies(PARAMETERS)).inverse_dynamics
@@ -89,7 +91,7 @@ def test_limits_hold_at_ten_times_the_samples_that_were_checked(task, informativ
 
 def test_motions_rest_at_both_ends_and_rates_are_derivatives(task, informative):
     motion = informative.motion
-    q, qd, qdd = sampled(motion, np.array([0.0, task.period]))
+    q, qd, qdd = sample(motion, np.array([0.0, task.period]))
     np.testing.assert_allclose(q[0], q[1], atol=1e-12)
     np.testing.assert_allclose([qd, qdd], 0, atol=1e-12)
     (_, *rates), slopes = jax.jit(lambda t: jax.jvp(lambda t: state(motion, t), (t,), (1.0,)))(0.7)
@@ -166,7 +168,7 @@ def test_the_largest_excess_is_named_and_used_limits_shrink_towards_the_middle(t
     q, qd, zero = jnp.array([-0.5, 0.0]), jnp.array([0.0, 4.0]), jnp.zeros(2)
     beyond, kind = worst(jax.jit(task.observe)(q, qd, zero)[2])
     assert kind == "velocity" and np.isclose(beyond, 4.0 / 3.0 - 1)
-    half = used(LIMITS, 0.5)
+    half = scale_limits(LIMITS, 0.5)
     assert np.allclose(half.position, [[-1.25, 0.25], [-1.25, 1.25]])
     assert np.allclose(half.velocity, [1.0, 1.5]) and np.isinf(half.force[1]).all() and half.force[0, 1] == 11.0
 
@@ -188,7 +190,7 @@ def test_bad_input_is_one_line(task, candidates):
         "harmonics is 1;": stated(harmonics=1),
         "period is 0": stated(period=0.0),
         "noise is": stated(noise=[0.1, 0.0]),
-        "share is 1.5": lambda: used(LIMITS, 1.5),
+        "share is 1.5": lambda: scale_limits(LIMITS, 1.5),
         "half the sampling rate": lambda: require_sampling(period=2.0, harmonics=10, rate=10.0),
         "force by": lambda: random_designs(impossible, 1),
         "choose from": lambda: design_set(task, candidates, criterion="best"),

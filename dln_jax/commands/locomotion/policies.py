@@ -74,21 +74,6 @@ def load_policy(folder: str | Path, **variation: float | None) -> StoredPolicy:
     return StoredPolicy(task, policy, load_tree(folder, MODEL, like), model.settings.width)
 
 
-def parameters_for(task: LocomotionTask, width: int, folder: Path) -> Parameters:
-    """Loads the parameters of a stored policy, to train it further on a task.
-
-    Raises:
-        InputError: `load_policy` refuses the folder, or the policy has another creature, width or clock.
-    """
-    stored = load_policy(folder)
-    policies = ((task, width), (stored.task, stored.width))
-    sizes, own = ({"creature": t.creature.name, "width": w, "clock-period": t.clock_period} for t, w in policies)
-    for name, value in sizes.items():
-        if own[name] != value:
-            raise InputError(f"the policy in {folder} has {name} {own[name]}, not {value}; give --{name} {own[name]}")
-    return stored.parameters
-
-
 def judge(trials: Trials, steps: int = STEPS) -> Verdict:
     """Returns the verdict by the share of episodes without a fall; doubtful if one of them ends behind its start."""
     standing, count = trials.standing(steps), len(trials.steps)
