@@ -9,9 +9,7 @@ from calls import assert_refused, command, exit_status, json_of, refused
 from motions import sums_of_sines
 
 from dln_jax.commands import check_data, train_delan
-from dln_jax.data import schema
-from dln_jax.runs.arguments import arguments_of
-from dln_jax.runs.encoders import prepare_log
+from dln_jax.data.log import read_log
 
 
 @pytest.fixture
@@ -63,9 +61,8 @@ def test_missing_rates_of_a_noisy_log_come_from_filtered_q_unless_the_user_decli
 def prepared(arrays, **changes):
     """Cutoff in Hz, lines and causes for a log with these columns."""
     np.savez("changed.npz", **{**arrays, **changes})
-    options = arguments_of(train_delan.Arguments, data=Path("changed.npz"), accept_log=True)
-    filtered, lines, causes, _ = prepare_log(options, schema.load("changed.npz"), Path("changed.npz"))
-    return filtered and filtered.cutoff, lines, causes
+    log = read_log("changed.npz", accept_log=True)
+    return log.smoothed and log.smoothed.cutoff, log.remarks, log.faults
 
 
 def test_a_log_is_filtered_by_default_only_where_noise_matters_and_rates_are_missing(log):
@@ -94,6 +91,5 @@ def test_options_that_make_no_filter_are_refused(log, capsys):
     rows = {
         "--cutoff fast": "expected Hz, a positive number, or auto",
         "--cutoff 90": "--cutoff 90: cutoff is 90 Hz; expected less than 50 Hz",
-        "--decimate 3": "add --cutoff auto",
     }
     assert_refused(capsys, train_delan, rows.items(), "--data log.npz", out=Path("run"))

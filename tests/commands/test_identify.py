@@ -10,7 +10,6 @@ from planar_arm import FRICTION, URDF, motions
 
 from dln_jax import load, load_c, read_robot
 from dln_jax.commands import identify
-from dln_jax.commands.identification.log import split
 from dln_jax.export.c.run import export_run
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
@@ -88,7 +87,7 @@ def test_mistakes_are_one_line(workplace, capsys):
     rows = {
         "--data other.npz": "joint 'shoulder' is not among the data's (elbow, wrist)",
         "--data one.npz": "the data have 1 joints, the robot 2",
-        "--data silent.npz": "have no tau",
+        "--data silent.npz": "there is no tau",
         "--robot broken.urdf": "not XML",
         "--velocity-scale 0": "velocity_scale is 0.0",
         "--window 0.3": "--window is for --by motions or both",
@@ -101,10 +100,11 @@ def test_mistakes_are_one_line(workplace, capsys):
 def test_trajectories_are_held_out_whole_and_one_in_blocks_of_time():
     six, one = (motions(0, samples=samples, trajectories=count) for samples, count in ((10, 6), (60, 1)))
     for asked, held in ((None, [2]), ("0,5", [0, 5])):
-        _, test, in_blocks = split(six, asked)
-        assert np.unique(test.trajectory).tolist() == held and not in_blocks
-    train, test, in_blocks = split(one, None)
-    assert in_blocks and len(train.t) == 48
+        parts = split_log(log_of(six, "six"), asked, validation=False)
+        assert np.unique(parts.sets.test.trajectory).tolist() == held and not parts.blocks
+    parts = split_log(log_of(one, "one"), validation=False)
+    assert parts.blocks and len(parts.sets.train.t) == 48
+    test = parts.sets.test
     assert [test.label[k] for k in np.unique(test.trajectory)] == ["0[2]", "0[7]"]
-    with one_line("one only"):
-        split(one, "0")
+    with one_line("leaves no trajectory to fit"):
+        split_log(log_of(one, "one"), "0", validation=False)

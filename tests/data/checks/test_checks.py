@@ -1,6 +1,5 @@
 """Every check finds the fault that is planted, names its joint, and is silent on data without it."""
 
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,19 +9,16 @@ from calls import one_line
 from motions import sums_of_sines
 
 from dln_jax import Robot
-from dln_jax.commands import train_delan
 from dln_jax.data.checks.channels import check_derivatives, flat_share
 from dln_jax.data.checks.priors import STRONGEST, WEAKEST, Explanation, covariances
 from dln_jax.data.checks.report import examine, quick, read, report
 from dln_jax.data.checks.torques import decisive
 from dln_jax.data.encoders.smoothing import smooth
-from dln_jax.data.log import FILTERED
+from dln_jax.data.log import FILTERED, log_of
 from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics.trees.description import dh_frames, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.mechanics.trees.recursions import newton_euler
-from dln_jax.runs.arguments import arguments_of
-from dln_jax.runs.encoders import prepare_log
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import cart_pole
 
@@ -362,13 +358,13 @@ def test_rotors_that_a_file_lacks_are_no_gears_and_no_clock():
 def test_torques_without_gravity_are_named_and_fitted_so():
     robot = planar(UPRIGHT)
     data = from_arrays(log(torques(planar((0.0, 0.0, 0.0)), (0.1, 0.1))))
-    options = arguments_of(train_delan.Arguments, data=Path("log.npz"))
-    _, lines, causes, measured = prepare_log(options, data, options.data, robot=robot)
-    assert any("tau holds no gravity" in line for line in lines) and not any("clock" in line for line in lines)
-    assert not any("gravity" in cause for cause in causes)
-    assert not np.any(measured.tree.gravity) and np.array_equal(measured.tree.inertias, robot.tree.inertias)
+    known = log_of(data, "log.npz", robot=robot, check=True)
+    assert any("tau holds no gravity" in line for line in known.remarks)
+    assert not any("clock" in line for line in known.remarks) and not any("gravity" in fault for fault in known.faults)
+    tree = known.robot.tree
+    assert not np.any(tree.gravity) and np.array_equal(tree.inertias, robot.tree.inertias)
     data = from_arrays(log(torques(robot, (0.0, 0.0))))
-    assert prepare_log(options, data, options.data, robot=robot)[-1] is robot
+    assert log_of(data, "log.npz", robot=robot, check=True).robot is robot
 
 
 def test_torques_late_by_200_ms_are_found_at_20_hz():
