@@ -15,6 +15,7 @@ from jax.typing import DTypeLike
 
 from dln_jax.mechanics.trees.description import tree_from_json
 from dln_jax.models.baselines import make_feed_forward, make_helmholtz, make_phase_network
+from dln_jax.models.differential_network import make_differential_network
 from dln_jax.models.hamiltonian import (
     make_black_box_hamiltonian,
     make_dissipative,
@@ -23,6 +24,7 @@ from dln_jax.models.hamiltonian import (
 )
 from dln_jax.models.joint_friction import with_joint_friction
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
+from dln_jax.models.latent_phase import make_image_model
 from dln_jax.models.model import Model
 from dln_jax.models.n_body import make_pairwise_hamiltonian
 from dln_jax.models.planar_chain import make_planar_chain
@@ -33,8 +35,6 @@ from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.models.trigonometric_kernel import make_trigonometric_kernel
 from dln_jax.types import InputError, Needs
-from dln_jax.zoo.differential_network import make_differential_network
-from dln_jax.zoo.images import make_image_model
 
 
 class Properties(NamedTuple):
