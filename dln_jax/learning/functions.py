@@ -10,7 +10,7 @@ Levenberg-Marquardt on all samples at once is for small networks, and reduces th
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -67,7 +67,7 @@ class Network(NamedTuple):
     """Seed of the initial parameters and of the order of the samples."""
 
 
-Targets = tuple[Array, Array | None, Array | None, Array | None]
+Targets = tuple[Array | None, ...]
 """x, y, dy and d2y of `FunctionSamples`; arrays that the loss does not read are `None` and never computed."""
 
 
@@ -110,13 +110,14 @@ def targets(data: FunctionSamples, network: Network) -> Targets:
         raise InputError("type1 fits the gradient, but the data have no dy; add it or choose type2")
     if network.derivative == 2 and d2y is None:
         raise InputError("derivative 2 fits the Hessian, but the data have no d2y; add it or choose derivative 1")
-    slope = None if dy is None else on_device("dy", dy, dtype)
-    curvature = None if d2y is None else on_device("d2y", d2y, dtype)
-    return on_device("x", data.x, dtype), on_device("y", data.y, dtype), slope, curvature
+    return tuple(
+        None if array is None else on_device(key, array, dtype)
+        for key, array in zip(FunctionSamples._fields, (data.x, data.y, dy, d2y), strict=True)
+    )
 
 
 def residual(
-    layers: Layers, x: Array, y: Array | None, dy: Array | None, d2y: Array | None, *, activation: Activation
+    layers: Layers, x: Array, y: Array, dy: Array | None, d2y: Array | None, *, activation: Activation
 ) -> Float[Array, "r"]:
     """Returns r of one sample: errors of the value, Jacobian and Hessian that have targets, concatenated."""
     if d2y is not None:
@@ -132,34 +133,6 @@ def residual(
 def mean_loss(layers: Layers, batch: Targets, *, activation: Activation) -> Scalar:
     """Mean over samples of |r|²."""
     return mean_square(functools.partial(residual, layers, activation=activation), batch)
-
-
-def train(
-    sets: SampleSplit,
-    network: Network,
-    optimiser: Optimiser,
-    *,
-    checkpoint: Checkpoint | None = None,
-    report: ProgressReport = silent,
-    mesh: Mesh | None = None,
-) -> Training:
-    """Fits the training samples and keeps the parameters with the lowest loss on the validation samples.
-
-    The resulting layers have a leading axis of ensemble members, even if there is only one. With Adam, all members see
-    the same batches and share one best step; Gauss-Newton keeps the best step of every member. Reports and history are
-    means over the members. Devices of a mesh share the members if Gauss-Newton trains several, otherwise the samples.
-    Errors as for `targets` and `fit`.
-    """
-    together = isinstance(optimiser, Adam)
-    members = network.members if together else 1
-
-    def mean(at: Progress) -> Progress:
-        loss, validation = float(np.mean(at.loss)) / members, float(np.mean(at.validation))
-        return at._replace(loss=loss, validation=validation, monitor=np.nan)
-
-    task = problem(sets, network, together=together)
-    training = fit(task, optimiser, checkpoint=checkpoint, report=lambda at: report(mean(at)), mesh=mesh)
-    return training._replace(history=[mean(at) for at in training.history], best_step=int(np.max(training.best_step)))
 
 
 def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
@@ -190,30 +163,51 @@ def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
     return Problem(None, layers, ours, score, network.seed, total)
 
 
-def grow_width(
-    sets: SampleSplit, network: Network, fit: Callable[[Network], Training], *, widths: Sequence[int] = WIDTHS
-) -> tuple[Trial, list[Trial]]:
-    """Trains networks of growing width with `fit` and chooses the smallest that no other beats significantly.
+def train(
+    sets: SampleSplit,
+    network: Network,
+    optimiser: Optimiser,
+    *,
+    checkpoint: Checkpoint | None = None,
+    report: ProgressReport = silent,
+    mesh: Mesh | None = None,
+) -> Training:
+    """Fits the training samples and keeps the parameters with the lowest loss on the validation samples.
 
-    The outcome of a trial is its `Training`.
+    The resulting layers have a leading axis of ensemble members, even if there is only one. With Adam, all members see
+    the same batches and share one best step; Gauss-Newton keeps the best step of every member. Reports and history are
+    means over the members. Devices of a mesh share the members if Gauss-Newton trains several, otherwise the samples.
+    Errors as for `targets` and `fit`.
     """
+    together = isinstance(optimiser, Adam)
+    members = network.members if together else 1
 
-    def fit_and_judge(candidate: Network) -> tuple[Training, Float[np.ndarray, " N"]]:
-        training = fit(candidate)
-        return training, validation_errors(sets, candidate, training.parameters)
+    def mean(at: Progress) -> Progress:
+        loss, validation = float(np.mean(at.loss)) / members, float(np.mean(at.validation))
+        return at._replace(loss=loss, validation=validation, monitor=np.nan)
 
-    return grow([network._replace(width=width) for width in widths], fit_and_judge)
+    task = problem(sets, network, together=together)
+    training = fit(task, optimiser, checkpoint=checkpoint, report=lambda at: report(mean(at)), mesh=mesh)
+    return training._replace(history=[mean(at) for at in training.history], best_step=int(np.max(training.best_step)))
 
 
-def validation_errors(sets: SampleSplit, network: Network, layers: Layers) -> Float[np.ndarray, " N"]:
-    """|r|² of every validation sample, averaged over the ensemble's members."""
+def grow_width(sets: SampleSplit, network: Network, fit: Callable[[Network], Training]) -> tuple[Trial, list[Trial]]:
+    """Trains networks of `WIDTHS` with `fit` and chooses the smallest that no other beats significantly.
+
+    The outcome of a trial is its `Training`. Errors are |r|² of validation samples, means over the ensemble's members.
+    """
+    held_out = targets(sets.validation, network)
     of_sample = functools.partial(residual, activation=activation(network.activation))
 
     @jax.jit
-    def squares(batch: Targets) -> Array:
+    def squares(layers: Layers, batch: Targets) -> Array:
         def of_member(member: Layers) -> Array:
             return jax.vmap(lambda *sample: jnp.sum(of_sample(member, *sample) ** 2))(*batch)
 
         return jnp.mean(jax.vmap(of_member)(layers), axis=0)
 
-    return np.asarray(squares(targets(sets.validation, network)))
+    def fit_and_judge(candidate: Network) -> tuple[Training, Float[np.ndarray, " N"]]:
+        training = fit(candidate)
+        return training, np.asarray(squares(training.parameters, held_out))
+
+    return grow([network._replace(width=width) for width in WIDTHS], fit_and_judge)

@@ -1,5 +1,7 @@
 """Figures of learned functions: value, gradient and Hessian of truth and model with errors; spread of ensembles."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -10,6 +12,10 @@ from matplotlib.patches import Rectangle
 
 from dln_jax.data.functions import FunctionSamples
 from dln_jax.figures import style
+from dln_jax.figures.training import training_curve
+from dln_jax.learning.engine.problem import Training, one_after_the_other
+from dln_jax.learning.model_selection import Trial
+from dln_jax.training.results import OF_LOSSES
 
 MODEL = style.colour("differential-network")
 HALO = {"color": "black", "linewidth": 3.0, "alpha": 0.3}
@@ -199,3 +205,20 @@ def _scaled(values: np.ndarray) -> tuple[np.ndarray, str]:
     size = float(np.abs(values).max())
     exponent = int(np.floor(np.log10(size))) if size > 0 and np.isfinite(size) else 0
     return (values, "") if -2 <= exponent <= 2 else (values / 10.0**exponent, rf", $10^{{{exponent}}}$")
+
+
+def training_figure(training: Training, trials: Sequence[Trial]) -> Figure:
+    """Losses of the training, or of all widths tried, one after the other."""
+    histories, before = [training.history], 0
+    if trials:
+        histories = [
+            [at._replace(stage=f"width {trial.candidate.width}") for at in trial.outcome.history] for trial in trials
+        ]
+        chosen = next(number for number, trial in enumerate(trials) if trial.outcome is training)
+        before = sum(history[-1].step for history in histories[:chosen])
+    return training_curve(
+        one_after_the_other(histories),
+        best_step=before + training.best_step,
+        unit="loss, in the units of the fit",
+        **OF_LOSSES,
+    )
