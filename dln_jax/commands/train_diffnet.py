@@ -102,21 +102,21 @@ def main(options: Arguments) -> None:
     from dln_jax.zoo.run import save
 
     # The samples
+    mesh = mesh_of(options)
     require_seed(options.seed)
     function, seed, is_named = options.function, options.seed, options.function in NAMES
     newton, several = options.optimizer == "gauss-newton", options.ensemble > 1
-    box, remarks = None, ()
+    drawn, box, remarks = {}, None, ()
     if is_named:
         bound = np.pi * (SHARE_OF_DATA if several else 1)
         drawn = resolved(options, {"samples": 25_600})
         data = published(function, **drawn, bound=bound, seed=seed)
-        test, shown = published_grid(function, bound=bound), published_grid(function)
+        test = published_grid(function, bound=bound)
         n, m = data.inputs, data.outputs
         units = Units(np.zeros(n), np.ones(n), np.zeros(m), np.ones(m))
-        box = bound if several else None
+        shown, box = (published_grid(function), bound) if several else (test, None)
     else:
         refuse_given(options, ["samples"], "an option of --function sin and cos_sin")
-        drawn = {}
         if not function.endswith(".npz"):
             raise InputError(f"function '{function}' is unknown; expected sin, cos_sin or an npz file's path")
         everything, remarks = load(function)
@@ -171,7 +171,6 @@ def main(options: Arguments) -> None:
 
             return train(standard, network, optimiser, checkpoint=checkpoint, report=report, mesh=mesh)
 
-    mesh = mesh_of(options)
     with command_folder(options, "train_diffnet") as folder:
         counts = f"{len(sets.train.x)} training, {len(sets.validation.x)} validation, {len(test.x)} test samples"
         print(f"{function}: {counts}, {data.inputs} inputs, {data.outputs} outputs", *remarks, sep="\n")
@@ -204,25 +203,11 @@ def main(options: Arguments) -> None:
         )
         save(folder, description, layers)
 
-        # Its errors and costs, of the stored model
+        # Errors, costs and figures of the stored model
         run, smooth = load_run(folder), activation(network.activation)
-        predicted, _ = predict(run.parameters, test.x, activation=smooth)
         mean, spread = predict(run.parameters, shown.x, activation=smooth)
+        predicted = mean if shown is test else predict(run.parameters, test.x, activation=smooth)[0]
         verdict = verdict_of(network, predicted, test)
-        metrics = {**errors(predicted, test), "verdict": verdict.number}
-        if box is not None and spread is not None:
-            inside = np.all(abs(shown.x) <= box, axis=1)
-            for name, where in (("spread_inside", inside), ("spread_outside", ~inside)):
-                metrics[name] = float(np.sqrt(np.mean(spread.y[where] ** 2)))
-        latency = one_step(run.derivatives, [(x,) for x in test.x[:512]], calls=1000)
-        parameters = sum(leaf.size for leaf in jax.tree.leaves(run.parameters))
-        metrics |= {"validation_loss": float(training.validation), "width": network.width}
-        metrics |= cost_metrics(training, latency, parameters=parameters, best_step=training.best_step)
-        lines = (RELU,) if network.activation == "relu" else ()
-        if training.stop.reason == "not finite":
-            lines = ("the loss stopped being finite; the run keeps the best parameters before that", *lines)
-
-        # Figures for the number of inputs
         figures = {"training.png": png(drawing.training_figure, training, trials)} if training.history else {}
         if data.inputs == 1:
             figures["curves.png"] = png(drawing.function_curves, shown, mean)
@@ -231,8 +216,22 @@ def main(options: Arguments) -> None:
             figures["surfaces.png"] = png(drawing.surfaces, shown, mean)
         else:
             figures["parity.png"] = png(drawing.parity, to_units(shown, units), to_units(mean, units))
+        metrics = {**errors(predicted, test), "verdict": verdict.number}
         if box is not None and spread is not None:
-            figures["ensemble.png"] = png(drawing.ensemble, shown, mean, spread, bound=box)
+            inside = np.all(abs(shown.x) <= box, axis=1)
+            for name, where in (("spread_inside", inside), ("spread_outside", ~inside)):
+                metrics[name] = float(np.sqrt(np.mean(spread.y[where] ** 2)))
+            if data.inputs == 1:
+                figures["ensemble.png"] = png(drawing.ensemble_curves, shown, mean, spread, box)
+            else:
+                figures["ensemble.png"] = png(drawing.ensemble_maps, spread, box)
+        latency = one_step(run.derivatives, [(x,) for x in test.x[:512]], calls=1000)
+        parameters = sum(leaf.size for leaf in jax.tree.leaves(run.parameters))
+        metrics |= {"validation_loss": float(training.validation), "width": network.width}
+        metrics |= cost_metrics(training, latency, parameters=parameters, best_step=training.best_step)
+        lines = (RELU,) if network.activation == "relu" else ()
+        if training.stop.reason == "not finite":
+            lines = ("the loss stopped being finite; the run keeps the best parameters before that", *lines)
         report = Report(
             metrics=metrics,
             rows=[

@@ -84,11 +84,12 @@ def split(data: FunctionSamples, *, seed: int = 0) -> SampleSplit:
     samples = len(data.x)
     count = held_out(samples, 0.1, "samples")
     order = np.random.default_rng((seed, samples)).permutation(samples)
-    train, validation = (
-        FunctionSamples(*(None if array is None else array[np.sort(part)] for array in data))
-        for part in (order[count:], order[:count])
-    )
-    return SampleSplit(train, validation)
+
+    def select(indices: np.ndarray) -> FunctionSamples:
+        dy, d2y = (None if array is None else array[indices] for array in (data.dy, data.d2y))
+        return FunctionSamples(data.x[indices], data.y[indices], dy, d2y)
+
+    return SampleSplit(select(np.sort(order[count:])), select(np.sort(order[:count])))
 
 
 def sine(x: np.ndarray) -> FunctionSamples:
@@ -105,7 +106,7 @@ def cosine_sine(x: np.ndarray) -> FunctionSamples:
     return FunctionSamples(x, (c1 * s2)[:, None], gradient[:, None], hessian[:, None])
 
 
-PUBLISHED = {"sin": (sine, 1, 100), "cos_sin": (cosine_sine, 2, 50)}
+PUBLISHED: dict[str, tuple[Any, int, int]] = {"sin": (sine, 1, 100), "cos_sin": (cosine_sine, 2, 50)}
 """Functions of the published protocol: samples at x, number of inputs, and points of a grid per input."""
 
 

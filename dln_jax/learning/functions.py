@@ -31,6 +31,7 @@ from dln_jax.learning.engine.problem import (
     ProgressReport,
     Training,
     mean_square,
+    selected_by,
     silent,
     unmonitored,
 )
@@ -153,9 +154,8 @@ def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
         return jax.vmap(lambda member: of_member(member, batch))(layers).sum()
 
     if not together:
-        seeds = jnp.full(network.members, network.seed)
         of_sample = functools.partial(residual, activation=function)
-        return Problem(of_sample, layers, ours, lambda member: unmonitored(of_member(member, theirs)), seeds)
+        return selected_by(theirs, of_sample, layers, ours, jnp.full(network.members, network.seed))
 
     def score(layers: Layers) -> tuple[Scalar, Scalar]:
         return unmonitored(total(layers, theirs) / network.members)

@@ -196,13 +196,12 @@ def film_errors(model: ImageModel, parameters: Any, test: Films) -> tuple[dict[s
     """
     parameters, pairs = with_float64(parameters), test.pairs
     move = functools.partial(predict, model.field, parameters["parameters"]["field"])
-    states = each("encode", model, parameters, pairs)
-    start = [state[:, 0] for state in states]
-    _, *motion = move(*start, np.arange(float(pairs.shape[1])))
-    _, *later = move(*start, np.concatenate([[0.0], LATE]))
+    q, p = each("encode", model, parameters, pairs)
+    moved = move(q[:, 0], p[:, 0], np.arange(float(pairs.shape[1])))
+    later = move(q[:, 0], p[:, 0], np.concatenate([[0.0], LATE]))
     films, recoded, late = (
-        np.asarray(each("decode", model, parameters, *motion))
-        for motion in (motion, states, [state[:, 1:] for state in later])
+        np.asarray(each("decode", model, parameters, *states))
+        for states in ((moved.q, moved.p), (q, p), (later.q[:, 1:], later.p[:, 1:]))
     )
     true = energy(test.q, test.qd)[:, :-1]
     return {
@@ -280,8 +279,9 @@ def inject_energy(
     move = functools.partial(predict, model.field, parameters["parameters"]["field"])
     before = move(q[:1], p[:1], t)
     ascend = jax.jit(functools.partial(raise_energy, H))
-    raised = ascend(jnp.asarray(before.q[0, -1]), jnp.asarray(before.p[0, -1]), ground + factor * (first - ground))
-    after = move(*(state[None] for state in raised), t)
+    wanted = ground + factor * (first - ground)
+    q_raised, p_raised = ascend(jnp.asarray(before.q[0, -1]), jnp.asarray(before.p[0, -1]), wanted)
+    after = move(q_raised[None], p_raised[None], t)
     q, p = (np.concatenate(halves, axis=1) for halves in ((before.q, after.q), (before.p, after.p)))
     pairs = np.asarray(each("decode", model, parameters, q, p)[0])
     level = np.asarray((jax.vmap(H)(q[0], p[0]) - ground) / (first - ground))
