@@ -106,11 +106,11 @@ def main(options: Arguments) -> None:
     require_seed(options.seed)
     function, seed, is_named = options.function, options.seed, options.function in NAMES
     newton, several = options.optimizer == "gauss-newton", options.ensemble > 1
-    drawn, box, remarks = {}, None, ()
+    sampling, box, remarks = {}, None, ()
     if is_named:
         bound = np.pi * (SHARE_OF_DATA if several else 1)
-        drawn = resolved(options, {"samples": 25_600})
-        data = published(function, **drawn, bound=bound, seed=seed)
+        sampling = resolved(options, {"samples": 25_600})
+        data = published(function, **sampling, bound=bound, seed=seed)
         test = published_grid(function, bound=bound)
         n, m = data.inputs, data.outputs
         units = Units(np.zeros(n), np.ones(n), np.zeros(m), np.ones(m))
@@ -204,9 +204,9 @@ def main(options: Arguments) -> None:
         save(folder, description, layers)
 
         # Errors, costs and figures of the stored model
-        run, smooth = load_run(folder), activation(network.activation)
-        mean, spread = predict(run.parameters, shown.x, activation=smooth)
-        predicted = mean if shown is test else predict(run.parameters, test.x, activation=smooth)[0]
+        run, nonlinearity = load_run(folder), activation(network.activation)
+        mean, spread = predict(run.parameters, shown.x, activation=nonlinearity)
+        predicted = mean if shown is test else predict(run.parameters, test.x, activation=nonlinearity)[0]
         verdict = verdict_of(network, predicted, test)
         figures = {"training.png": png(drawing.training_figure, training, trials)} if training.history else {}
         if data.inputs == 1:
@@ -243,7 +243,7 @@ def main(options: Arguments) -> None:
             verdict=verdict,
             ended_by_user=bool(options.steps or options.epochs),
             figures=figures,
-            chosen={**network._asdict(), "optimizer": options.optimizer, **optimiser._asdict(), **drawn},
+            chosen={**network._asdict(), "optimizer": options.optimizer, **optimiser._asdict(), **sampling},
             lines=lines,
         )
         finish(folder, options, report)

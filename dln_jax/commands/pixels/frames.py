@@ -177,7 +177,7 @@ def velocity_between(first: Scalar, second: Scalar) -> Scalar:
 
 
 @functools.partial(jax.jit, static_argnames=("function", "model"))
-def each(function: str, model: ImageModel, parameters: Any, *arrays: Any) -> Any:
+def apply(function: str, model: ImageModel, parameters: Any, *arrays: Any) -> Any:
     """Applies "encode" or "decode" of a model to arrays [K, T, n]; compiled once per model, for all parameters."""
     return jax.vmap(jax.vmap(getattr(model.images(parameters), function)))(*arrays)
 
@@ -196,11 +196,11 @@ def film_errors(model: ImageModel, parameters: Any, test: Films) -> tuple[dict[s
     """
     parameters, pairs = with_float64(parameters), test.pairs
     move = functools.partial(predict, model.field, parameters["parameters"]["field"])
-    q, p = each("encode", model, parameters, pairs)
+    q, p = apply("encode", model, parameters, pairs)
     moved = move(q[:, 0], p[:, 0], np.arange(float(pairs.shape[1])))
     later = move(q[:, 0], p[:, 0], np.concatenate([[0.0], LATE]))
     films, recoded, late = (
-        np.asarray(each("decode", model, parameters, *states))
+        np.asarray(apply("decode", model, parameters, *states))
         for states in ((moved.q, moved.p), (q, p), (later.q[:, 1:], later.p[:, 1:]))
     )
     true = energy(test.q, test.qd)[:, :-1]
@@ -273,7 +273,7 @@ def inject_energy(
         raise InputError("the model has no energy to raise; give one whose latent field is a black-box-hnn")
     H = field.energy
     still = np.tile(_films(jnp.zeros(1))[0], 2)
-    q, p = (state[0] for state in each("encode", model, parameters, np.stack([pair, still])[None]))
+    q, p = (state[0] for state in apply("encode", model, parameters, np.stack([pair, still])[None]))
     first, ground = jax.vmap(H)(q, p)
     t = np.arange(float(frames))
     move = functools.partial(predict, model.field, parameters["parameters"]["field"])
@@ -283,7 +283,7 @@ def inject_energy(
     q_raised, p_raised = ascend(jnp.asarray(before.q[0, -1]), jnp.asarray(before.p[0, -1]), wanted)
     after = move(q_raised[None], p_raised[None], t)
     q, p = (np.concatenate(halves, axis=1) for halves in ((before.q, after.q), (before.p, after.p)))
-    pairs = np.asarray(each("decode", model, parameters, q, p)[0])
+    pairs = np.asarray(apply("decode", model, parameters, q, p)[0])
     level = np.asarray((jax.vmap(H)(q[0], p[0]) - ground) / (first - ground))
     physical = energy(*physical_states(pairs))
     return Injection(np.concatenate([t, t[-1] + t]), q[0, :, 0], p[0, :, 0], pairs, level, physical)
