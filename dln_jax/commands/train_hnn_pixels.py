@@ -5,18 +5,83 @@ model.safetensors and model.json (load them with dln_jax.load), a checkpoint to 
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
-from dln_jax.training.hamiltonian.options import ImageOptions
+from dln_jax.runs.arguments import Unstated, require_positive_if_given
+from dln_jax.runs.options import Drawn, Resumable
 
 
 @dataclass(frozen=True)
-class Arguments(ImageOptions):
+class PixelOptions:
+    """Films of a pendulum, and what is learned from them."""
+
+    model: Literal["black-box-hnn", "phase-network"] = "black-box-hnn"
+    """An energy in the latent plane, or a network that gives the rates there."""
+    trajectories: Unstated[int] = None
+    """Generated films (default: as published)."""
+    steps: Unstated[int] = None
+    """Steps of adam (default: those of the published recipe)."""
+    seed: int = 0
+    """Seed of parameters and shuffling."""
+
+
+@dataclass(frozen=True)
+class Arguments(Drawn, Resumable, PixelOptions):
     """What to train on, how, and where the results go."""
 
 
 def main(options: Arguments) -> None:
     """Trains and evaluates the model, and writes the run folder."""
-    from dln_jax.training.hamiltonian.pixels import IMAGES
-    from dln_jax.training.pipeline import train
+    import jax
+    import numpy as np
 
-    train(IMAGES, options, "train_hnn_pixels")
+    from dln_jax.commands.pixels.figures import injection_figure, write_film
+    from dln_jax.commands.pixels.fit import fit, measure, optimiser
+    from dln_jax.commands.pixels.frames import PIXELS, TRAJECTORIES, judge_films, swinging_rod
+    from dln_jax.figures.training import training_curve
+    from dln_jax.learning.engine.checkpoint import Checkpoint, identity
+    from dln_jax.runs.progress import progress
+    from dln_jax.runs.report import Report, finish, png
+    from dln_jax.runs.stored_arguments import command_folder
+    from dln_jax.training.results import OF_LOSSES, losses
+    from dln_jax.types import require_seed
+    from dln_jax.zoo.descriptions import build
+    from dln_jax.zoo.run import save
+
+    require_seed(options.seed)
+    require_positive_if_given(options, ["steps", "trajectories"])
+    kind, adam = options.model, optimiser(options.steps)
+    train, validation, test = swinging_rod(options.trajectories or TRAJECTORIES)
+    with command_folder(options, "train_hnn_pixels") as folder:
+        print(f"pixels: {len(train.q)} films to train on, {len(validation.q)} to select by; {kind}, f32")
+        known = identity(adam, [train.frames, validation.frames], model=kind, seed=options.seed)
+        with progress(adam.steps) as show:
+            description, parameters, training = fit(
+                kind,
+                train,
+                validation,
+                seed=options.seed,
+                steps=adam.steps,
+                checkpoint=Checkpoint(folder, known, options.resume),
+                report=lambda at: show(at.step, losses(at)),
+            )
+        save(folder, description, jax.tree.map(np.float32, parameters))
+        numbers, films = measure(description, parameters, training, test)
+        verdict = judge_films(films, test)
+        curve = {"best_step": training.best_step, "unit": "loss", **OF_LOSSES}
+        figures = {
+            "pixels.gif": lambda path: write_film(path, kind, films[0, :, :PIXELS], test.frames[0, :-1]),
+            "training.png": png(training_curve, training.history, **curve),
+        }
+        if kind == "black-box-hnn":
+            figures["pixels-injection.png"] = png(injection_figure, build(description), parameters, test)
+        report = Report(
+            metrics={key: value for key, value in numbers.items() if np.isfinite(value)} | {"verdict": verdict.number},
+            rows=[(name.replace("_", " "), f"{value:.4g}") for name, value in numbers.items()],
+            title=f"test films, {kind}",
+            columns=("quantity", "value"),
+            verdict=verdict,
+            figures=figures,
+            ended_by_user=options.steps is not None,
+        )
+        finish(folder, options, report)

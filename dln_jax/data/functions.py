@@ -75,72 +75,70 @@ def from_arrays(arrays: dict[str, Any]) -> FunctionSamples:
     return FunctionSamples(x, y, _derivative(arrays, "dy", x, y, 1), _derivative(arrays, "d2y", x, y, 2))
 
 
-def split(data: FunctionSamples, *, validation_share: float = 0.1, seed: int = 0) -> SampleSplit:
-    """Draws validation samples by the seed, leaving at least one sample in either set.
+def split(data: FunctionSamples, *, seed: int = 0) -> SampleSplit:
+    """Draws a tenth of independent samples for validation by the seed, and at least one.
 
-    Use it for independent samples. Raises InputError for a share outside (0, 1), or fewer than two samples.
+    Raises:
+        InputError: there are fewer than two samples.
     """
     samples = len(data.x)
-    count = held_out(samples, validation_share, "samples")
+    count = held_out(samples, 0.1, "samples")
     order = np.random.default_rng((seed, samples)).permutation(samples)
-    return SampleSplit(train=select(data, np.sort(order[count:])), validation=select(data, np.sort(order[:count])))
+
+    def select(indices: np.ndarray) -> FunctionSamples:
+        dy, d2y = (None if array is None else array[indices] for array in (data.dy, data.d2y))
+        return FunctionSamples(data.x[indices], data.y[indices], dy, d2y)
+
+    return SampleSplit(select(np.sort(order[count:])), select(np.sort(order[:count])))
 
 
-def select(data: FunctionSamples, indices: np.ndarray) -> FunctionSamples:
-    """Selects samples by indices or a mask."""
-    dy, d2y = (None if array is None else array[indices] for array in (data.dy, data.d2y))
-    return FunctionSamples(data.x[indices], data.y[indices], dy, d2y)
-
-
-def sine(*, samples: int = 25_600, noise: float = 1e-3, bound: float = np.pi, seed: int = 0) -> FunctionSamples:
-    """f(x) = sin x at x uniform in [-bound, bound], with independent Gaussian noise on all stored arrays.
-
-    The published protocol has 25,600 samples, bound π, and noise of standard deviation 1e-3 on x, f and f'. The stored
-    x is the noisy one, so even the true function leaves residuals. The Hessian, which the published losses do not use,
-    has the same noise.
-    Raises InputError if samples or bound are not positive, or the noise is negative.
-    """
-    return _noisy_samples(_exact_sine, 1, samples, noise, bound, seed)
-
-
-def cosine_sine(*, samples: int = 25_600, noise: float = 1e-3, bound: float = np.pi, seed: int = 0) -> FunctionSamples:
-    """f(x) = cos x_1 sin x_2 on [-bound, bound]², drawn as for `sine`."""
-    return _noisy_samples(_exact_cosine_sine, 2, samples, noise, bound, seed)
-
-
-def sine_grid(*, points: int = 100, bound: float = np.pi) -> FunctionSamples:
-    """sin x with exact derivatives at evenly spaced points of [-bound, bound], ends included."""
-    return _exact_sine(np.linspace(-bound, bound, points)[:, None])
-
-
-def cosine_sine_grid(*, points: int = 50, bound: float = np.pi) -> FunctionSamples:
-    """cos x_1 sin x_2 with exact derivatives on a grid of points² over [-bound, bound]², x_1 the slower index."""
-    axis = np.linspace(-bound, bound, points)
-    return _exact_cosine_sine(np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2))
-
-
-def _exact_sine(x: np.ndarray) -> FunctionSamples:
+def sine(x: np.ndarray) -> FunctionSamples:
+    """sin x with exact derivatives, for x [N, 1]."""
     value, slope = np.sin(x), np.cos(x)
     return FunctionSamples(x, value, slope[:, :, None], -value[:, :, None, None])
 
 
-def _exact_cosine_sine(x: np.ndarray) -> FunctionSamples:
+def cosine_sine(x: np.ndarray) -> FunctionSamples:
+    """cos x_1 sin x_2 with exact derivatives, for x [N, 2]."""
     (c1, s1), (c2, s2) = ((np.cos(column), np.sin(column)) for column in x.T)
     gradient = np.stack([-s1 * s2, c1 * c2], axis=-1)
     hessian = np.stack([np.stack([-c1 * s2, -s1 * c2], -1), np.stack([-s1 * c2, -c1 * s2], -1)], -1)
     return FunctionSamples(x, (c1 * s2)[:, None], gradient[:, None], hessian[:, None])
 
 
-def _noisy_samples(exact, n: int, samples: int, noise: float, bound: float, seed: int) -> FunctionSamples:
+PUBLISHED: dict[str, tuple[Any, int, int]] = {"sin": (sine, 1, 100), "cos_sin": (cosine_sine, 2, 50)}
+"""Functions of the published protocol: samples at x, number of inputs, and points of a grid per input."""
+
+
+def published(
+    name: str, *, samples: int = 25_600, noise: float = 1e-3, bound: float = np.pi, seed: int = 0
+) -> FunctionSamples:
+    """Samples of a function of `PUBLISHED` at x uniform in [-bound, bound], with Gaussian noise on all arrays.
+
+    The published protocol has 25,600 samples, bound π, and noise of standard deviation 1e-3 on x, f and f'. The stored
+    x is the noisy one, so even the true function leaves residuals. The Hessian, which the published losses do not use,
+    has the same noise.
+
+    Raises:
+        InputError: samples or bound are not positive, or the noise is negative.
+    """
     require_positive(samples=samples, bound=bound)
     if not (0 <= noise < np.inf and bound < np.inf):
         raise InputError(f"noise is {noise} and the bound {bound}; expected finite numbers, the noise zero or positive")
+    exact, inputs, _ = PUBLISHED[name]
     random = np.random.default_rng(seed)
-    clean = exact(random.uniform(-bound, bound, (samples, n)))
+    clean = exact(random.uniform(-bound, bound, (samples, inputs)))
     noisy = [array + noise * random.normal(size=array.shape) for array in clean]
-    rows, columns = np.tril_indices(n)
+    rows, columns = np.tril_indices(inputs)
     noisy[3][..., rows, columns] = noisy[3][..., columns, rows]  # a Hessian stays symmetric
     return FunctionSamples(*noisy)
+
+
+def published_grid(name: str, *, bound: float = np.pi) -> FunctionSamples:
+    """A function of `PUBLISHED` on an even grid over [-bound, bound], ends included; the first input is the slowest."""
+    exact, inputs, points = PUBLISHED[name]
+    axes = [np.linspace(-bound, bound, points)] * inputs
+    return exact(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, inputs))
 
 
 def _derivative(arrays: dict[str, Any], key: str, x: np.ndarray, y: np.ndarray, order: int) -> np.ndarray | None:

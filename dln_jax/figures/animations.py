@@ -1,4 +1,4 @@
-"""Animated GIFs, written frame by frame: image sequences, and motions in the plane over the truth."""
+"""Animated GIFs, written frame by frame, and motions in the plane over the truth."""
 
 import io
 from collections.abc import Callable, Iterable, Mapping
@@ -20,8 +20,6 @@ from dln_jax.types import InputError, require_positive
 
 DPI, COLOURS = 100, 128
 """Pixels per inch, and number of colours of a GIF."""
-ONLY_TRUTH, ONLY_MODEL = np.array([0.0, 0.45, 0.7]), np.array([1.0, 0.55, 0.3])
-"""Colours of pixels present in only one of two films; their sum is white."""
 
 
 def write_gif(
@@ -59,46 +57,6 @@ def write_gif(
     content, duration = io.BytesIO(), round(1000 / frames_per_second)
     images[0].save(content, "gif", save_all=True, append_images=images[1:], duration=duration, loop=0)
     write_bytes(path, content.getvalue())
-
-
-def write_frame_gif(
-    path: Path,
-    frames: Mapping[str, Float[np.ndarray, "T pixels"]],
-    t: Float[np.ndarray, " times"],
-    *,
-    frames_per_second: float = 20.0,
-) -> None:
-    """Writes square images of systems as a GIF, each over the truth if "truth" is among them: white pixels agree.
-
-    Images are intensities in [0, 1], row by row; values beyond are clipped. Times are in s.
-
-    Raises:
-        InputError: there is no system, images are not square, or the number of images differs from that of the times.
-    """
-    require_positive(frames_per_second=frames_per_second)
-    _require_common_length(t, {name: images.shape[0] for name, images in frames.items()})
-    pixels = next(iter(frames.values())).shape[1]
-    side = round(np.sqrt(pixels))
-    if side * side != pixels:
-        raise InputError(f"images have {pixels} pixels; expected a square, row by row")
-    squares = {name: np.clip(images, 0.0, 1.0).reshape(-1, side, side, 1) for name, images in frames.items()}
-    models = [name for name in frames if name != TRUTH] or [TRUTH]
-    over = TRUTH in frames and models != [TRUTH]
-    figure, axes = style.figure(1, len(models), width=2.4 * len(models), height=2.9 + 0.3 * over, dpi=DPI)
-    images = {name: axis.imshow(np.zeros((side, side, 3))) for name, axis in zip(models, axes[0], strict=True)}
-    for name, axis in zip(models, axes[0], strict=True):
-        style.title(axis, name, color=style.colour(name))
-        axis.set(xticks=[], yticks=[])
-        axis.grid(False)
-    if over:
-        figure.supxlabel("white: both  blue: truth only\norange: model only", fontsize=7)
-
-    def show(index: int) -> None:
-        for name, image in images.items():
-            truth = squares[TRUTH if over else name][index]
-            image.set_data(truth * ONLY_TRUTH + squares[name][index] * ONLY_MODEL)
-
-    write_gif(path, figure, show, t, frames=range(len(t)), frames_per_second=frames_per_second)
 
 
 def write_motion_gif(

@@ -9,10 +9,7 @@ from matplotlib.figure import Figure
 
 from dln_jax.figures import style
 from dln_jax.figures.style import TRUTH
-from dln_jax.metrics.frames import Injection
 from dln_jax.metrics.phase_space import Motions
-from dln_jax.scenes.datasets.pendulum_frames import FRAME_TIME
-from dln_jax.types import require_positive
 
 Field = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(q [N, 1], p [N, 1]) -> (qd, pd)."""
@@ -102,44 +99,3 @@ def plane_paths(motions: Motions, shown: int) -> list[tuple[np.ndarray, np.ndarr
     if q.shape[1] == 1:
         return [(q[:, 0], p[:, 0])]
     return [(q[:, 2 * body], q[:, 2 * body + 1]) for body in range(q.shape[1] // 2)]
-
-
-def injection_figure(injection: Injection, *, shown: int = 7) -> Figure:
-    """Decoded frames before and after the injection, the latent path, and the energies over time."""
-    require_positive(shown=shown)
-    total = len(injection.level)
-    half = total // 2
-    side = round(np.sqrt(injection.pairs.shape[1] // 2))
-    figure = style.blank(height=5.0)
-    upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.0, 1.05])[:, 0]
-    colours = style.BLUE, style.VERMILLION
-    rows = upper.subplots(2, shown, squeeze=False)
-    for row, first, colour, name in zip(rows, (0, half), colours, ("before", "after"), strict=True):
-        for axis, index in zip(row, np.linspace(first, first + half - 1, shown).astype(int), strict=True):
-            axis.imshow(injection.pairs[index, : side * side].reshape(side, side), cmap="gray", vmin=0, vmax=1)
-            axis.set(xticks=[], yticks=[])
-            time = f"{FRAME_TIME * injection.latent.t[index]:.2f} s"
-            style.title(axis, time, fontsize=style.SMALL, color=colour)
-        row[0].set_ylabel(name, color=colour, fontsize=style.TEXT)
-    plane, levels = lower.subplots(1, 2, width_ratios=[1.0, 1.6])
-    joules = levels.twinx()
-    style.prepare(plane, levels, joules)
-    q, p = injection.latent.q[0, :, 0], injection.latent.p[0, :, 0]
-    t = FRAME_TIME * injection.latent.t
-    for part, colour in zip((slice(0, half), slice(half, total)), colours, strict=True):
-        plane.plot(q[part], p[part], color=colour, linewidth=1.5)
-        levels.plot(t[part], injection.level[part], color=colour, linewidth=5.0, alpha=0.4)
-        joules.plot(t[part], injection.physical[part], ":", color="black", linewidth=1.6)
-    plane.annotate("", (q[half], p[half]), (q[half - 1], p[half - 1]), arrowprops={"arrowstyle": "->", "lw": 1.6})
-    plane.set(xlabel="latent q, 1", ylabel="latent p, 1 per frame")
-    style.title(plane, "path in the latent plane")
-    levels.set(xlabel="t, s", ylabel="latent H / H at the start, 1")
-    style.title(levels, "energy: latent (band), of the frames (dots)")
-    joules.set_ylabel("energy of the frames, J")
-    joules.grid(False)
-    joules.spines["right"].set_visible(True)
-    start = injection.physical[:half].mean()
-    top = 1.25 * max(float(injection.level.max()), float(injection.physical.max() / start))
-    levels.set_ylim(0.0, top)
-    joules.set_ylim(0.0, top * start)
-    return figure

@@ -10,7 +10,7 @@ Levenberg-Marquardt on all samples at once is for small networks, and reduces th
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -31,10 +31,11 @@ from dln_jax.learning.engine.problem import (
     ProgressReport,
     Training,
     mean_square,
+    selected_by,
     silent,
     unmonitored,
 )
-from dln_jax.learning.select import Trial, grow
+from dln_jax.learning.select import Trial, select
 from dln_jax.nn import differential_mlp, ensembles
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers
@@ -67,7 +68,7 @@ class Network(NamedTuple):
     """Seed of the initial parameters and of the order of the samples."""
 
 
-Targets = tuple[Array, Array | None, Array | None, Array | None]
+Targets = tuple[Array | None, ...]
 """x, y, dy and d2y of `FunctionSamples`; arrays that the loss does not read are `None` and never computed."""
 
 
@@ -110,13 +111,14 @@ def targets(data: FunctionSamples, network: Network) -> Targets:
         raise InputError("type1 fits the gradient, but the data have no dy; add it or choose type2")
     if network.derivative == 2 and d2y is None:
         raise InputError("derivative 2 fits the Hessian, but the data have no d2y; add it or choose derivative 1")
-    slope = None if dy is None else on_device("dy", dy, dtype)
-    curvature = None if d2y is None else on_device("d2y", d2y, dtype)
-    return on_device("x", data.x, dtype), on_device("y", data.y, dtype), slope, curvature
+    return tuple(
+        None if array is None else on_device(key, array, dtype)
+        for key, array in zip(FunctionSamples._fields, (data.x, data.y, dy, d2y), strict=True)
+    )
 
 
 def residual(
-    layers: Layers, x: Array, y: Array | None, dy: Array | None, d2y: Array | None, *, activation: Activation
+    layers: Layers, x: Array, y: Array, dy: Array | None, d2y: Array | None, *, activation: Activation
 ) -> Float[Array, "r"]:
     """Returns r of one sample: errors of the value, Jacobian and Hessian that have targets, concatenated."""
     if d2y is not None:
@@ -132,6 +134,33 @@ def residual(
 def mean_loss(layers: Layers, batch: Targets, *, activation: Activation) -> Scalar:
     """Mean over samples of |r|²."""
     return mean_square(functools.partial(residual, layers, activation=activation), batch)
+
+
+def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
+    """Builds an ensemble's problem: the sum of its members' losses, or for Gauss-Newton members as seeds."""
+    ours, theirs = (targets(data, network) for data in sets)
+    sizes = (sets.train.inputs, *(network.width,) * network.depth, sets.train.outputs)
+    layers = ensembles.init(
+        jax.random.key(network.seed), sizes, members=network.members, dtype=data_type(network.precision)
+    )
+    function = activation(network.activation)
+    of_member = functools.partial(mean_loss, activation=function)
+
+    def total(layers: Layers, batch: Targets) -> Scalar:
+        """The sum of losses leaves every member's gradient, and so its training, the same as alone."""
+        if network.members == 1:
+            # An axis of one member would turn all products into batched ones, at two or three times the cost.
+            return of_member(jax.tree.map(lambda leaf: leaf[0], layers), batch)
+        return jax.vmap(lambda member: of_member(member, batch))(layers).sum()
+
+    if not together:
+        of_sample = functools.partial(residual, activation=function)
+        return selected_by(theirs, of_sample, layers, ours, jnp.full(network.members, network.seed))
+
+    def score(layers: Layers) -> tuple[Scalar, Scalar]:
+        return unmonitored(total(layers, theirs) / network.members)
+
+    return Problem(None, layers, ours, score, network.seed, total)
 
 
 def train(
@@ -162,58 +191,23 @@ def train(
     return training._replace(history=[mean(at) for at in training.history], best_step=int(np.max(training.best_step)))
 
 
-def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
-    """Builds an ensemble's problem: the sum of its members' losses, or for Gauss-Newton members as seeds."""
-    ours, theirs = (targets(data, network) for data in sets)
-    sizes = (sets.train.inputs, *(network.width,) * network.depth, sets.train.outputs)
-    layers = ensembles.init(
-        jax.random.key(network.seed), sizes, members=network.members, dtype=data_type(network.precision)
-    )
-    function = activation(network.activation)
-    of_member = functools.partial(mean_loss, activation=function)
+def grow_width(sets: SampleSplit, network: Network, fit: Callable[[Network], Training]) -> tuple[Trial, list[Trial]]:
+    """Trains networks of `WIDTHS` with `fit` and chooses the smallest that no other beats significantly.
 
-    def total(layers: Layers, batch: Targets) -> Scalar:
-        """The sum of losses leaves every member's gradient, and so its training, the same as alone."""
-        if network.members == 1:
-            # An axis of one member would turn all products into batched ones, at two or three times the cost.
-            return of_member(jax.tree.map(lambda leaf: leaf[0], layers), batch)
-        return jax.vmap(lambda member: of_member(member, batch))(layers).sum()
-
-    if not together:
-        seeds = jnp.full(network.members, network.seed)
-        of_sample = functools.partial(residual, activation=function)
-        return Problem(of_sample, layers, ours, lambda member: unmonitored(of_member(member, theirs)), seeds)
-
-    def score(layers: Layers) -> tuple[Scalar, Scalar]:
-        return unmonitored(total(layers, theirs) / network.members)
-
-    return Problem(None, layers, ours, score, network.seed, total)
-
-
-def grow_width(
-    sets: SampleSplit, network: Network, fit: Callable[[Network], Training], *, widths: Sequence[int] = WIDTHS
-) -> tuple[Trial, list[Trial]]:
-    """Trains networks of growing width with `fit` and chooses the smallest that no other beats significantly.
-
-    The outcome of a trial is its `Training`.
+    The outcome of a trial is its `Training`. Errors are |r|² of validation samples, means over the ensemble's members.
     """
-
-    def fit_and_judge(candidate: Network) -> tuple[Training, Float[np.ndarray, " N"]]:
-        training = fit(candidate)
-        return training, validation_errors(sets, candidate, training.parameters)
-
-    return grow([network._replace(width=width) for width in widths], fit_and_judge)
-
-
-def validation_errors(sets: SampleSplit, network: Network, layers: Layers) -> Float[np.ndarray, " N"]:
-    """|r|² of every validation sample, averaged over the ensemble's members."""
+    held_out = targets(sets.validation, network)
     of_sample = functools.partial(residual, activation=activation(network.activation))
 
     @jax.jit
-    def squares(batch: Targets) -> Array:
+    def squares(layers: Layers, batch: Targets) -> Array:
         def of_member(member: Layers) -> Array:
             return jax.vmap(lambda *sample: jnp.sum(of_sample(member, *sample) ** 2))(*batch)
 
         return jnp.mean(jax.vmap(of_member)(layers), axis=0)
 
-    return np.asarray(squares(targets(sets.validation, network)))
+    def fit_and_judge(candidate: Network) -> tuple[Training, Float[np.ndarray, " N"]]:
+        training = fit(candidate)
+        return training, np.asarray(squares(training.parameters, held_out))
+
+    return select([network._replace(width=width) for width in WIDTHS], fit_and_judge, patience=2)

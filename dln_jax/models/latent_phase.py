@@ -4,7 +4,7 @@
     z_q = encoder(x_1),  z_p = encoder(x_2) - z_q,     x_1_hat = decoder(z_q),  x_2_hat = decoder(z_q + z_p)
     d(z_q, z_p) / d frame = rates(z_q, z_p)
 
-x_1, x_2 [n / 2] are consecutive frames; the second one determines the velocity. For any parameters the momentum is the
+x_1, x_2 [n] are consecutive frames; the second one determines the velocity. For any parameters the momentum is the
 change of the coordinate per frame; the published autoencoder, (z_q, z_p) = encoder(x_1, x_2), has to learn this. Both
 networks have four layers, the hidden ones residual:
 
@@ -17,32 +17,32 @@ with nearly the same distances, up to the lost variance,
     c = B (x - mean),   x_hat = mean + Bᵀ c,   rows of B [C, n]: the eigenvectors of the covariance, largest first
 """
 
-import functools
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import haiku as hk
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float
 
+from dln_jax.mechanics.arguments import vectors
 from dln_jax.mechanics.dynamics import Flow, PhaseRates, PlainFlow
 from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.models.baselines import make_phase_network
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian
-from dln_jax.models.model import Model, Parameters
+from dln_jax.models.model import Model
 from dln_jax.nn.activations import Activation, silu, tanh
-from dln_jax.nn.activations import activation as activation_of
 from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Needs, require_positive
 
 NEEDS = Needs(joints=("prismatic",))
 """Needs of the latent plane: z_q is a number, not an angle, without applied forces or friction."""
 LAYERS = 4
+MOST_NUMBERS = 10**8
+"""Largest number of entries in the basis of principal components."""
 Field = Literal["black-box-hnn", "phase-network"]
 """Dynamics of the latent plane: from an energy, or from a network for the rates."""
 
@@ -53,53 +53,105 @@ class LatentPhase(NamedTuple):
     """Autoencoder and dynamics of the latent plane, as functions of one sample; use `vmap` for batches."""
 
     encode: Callable[[Array], tuple[Array, Array]]
-    """Two frames [n] -> (z_q, z_p), both [1]."""
+    """Two frames [2 n] -> (z_q, z_p), both [1]."""
     decode: Callable[[Array, Array], Array]
-    """(z_q, z_p) -> two frames [n]."""
+    """(z_q, z_p) -> two frames [2 n]."""
     field: Flow | PlainFlow
     """(z_q, z_p) -> rates per frame; with an energy for black-box-hnn."""
 
 
-class LatentModel(NamedTuple):
-    """Autoencoder and latent dynamics with parameters, as an (init, apply) pair."""
+class ImageModel(NamedTuple):
+    """A parametric model of images and their latent plane."""
 
-    init: Callable[[Array], Parameters]
-    """Random key -> parameters: a dictionary of "encoder", "decoder" and "field"."""
-    apply: Callable[[Parameters], LatentPhase]
-    """Parameters -> functions."""
+    init: Callable[[Array], Any]
+    """Random key -> {"parameters": of the networks "encoder", "decoder" and "field", "components": of the images, with
+    their "mean" [n], "basis" [C, n] and the "scale" of a coefficient}."""
+    images: Callable[[Any], LatentPhase]
+    """Parameters -> functions of two successive images [2 n]."""
+    coefficients: Callable[[Any, float | Array], LatentPhase]
+    """(parameters of the networks, scale) -> the same of the images' coefficients [2 C], for the training."""
     field: Model
-    """Model of the latent dynamics; its parameters are `parameters["field"]`."""
+    """Model of the latent dynamics; its parameters are those of the network "field"."""
 
 
-def latent_field(
-    name: str,
+def make_image_model(
     *,
-    width: int = 64,
-    depth: int = 2,
-    activation: Activation | str = tanh,
+    field: Field,
+    pixels: int,
+    components: int,
+    field_width: int = 64,
+    field_depth: int = 2,
+    field_activation: Activation = tanh,
+    width: int = 200,
+    activation: Activation = silu,
     momentum_scale: float = 0.2,
     dtype: DTypeLike = jnp.float32,
-) -> Model:
-    """Returns a model of one coordinate: a black-box energy, or a network for the rates.
+) -> ImageModel:
+    """Makes a model of images that encodes each frame by its principal components.
 
     Args:
-        name: black-box-hnn or phase-network.
+        field: kind of dynamics in the latent plane.
+        field_width: hidden units per layer of the latent dynamics.
+        field_depth: hidden layers of the latent dynamics.
+        width: hidden units per layer of encoder and decoder.
         momentum_scale: typical size of z_p relative to that of z_q: 0.2 for motions of 30 frames per period.
-        width, depth, activation, dtype: as described in `models.model`.
 
     Raises:
-        InputError: the name is unknown, or a size is not positive.
+        InputError: a size that is not positive, or components of more than `MOST_NUMBERS` entries.
     """
-    if name not in get_args(Field):
-        raise InputError(f"field is '{name}'; expected one of {', '.join(get_args(Field))}")
-    size: dict[str, Any] = {"width": width, "depth": depth, "activation": activation, "dtype": dtype}
+    require_positive(pixels=pixels, components=components)
+    if pixels * components > MOST_NUMBERS:
+        raise InputError(f"{components} components of {pixels} pixels are more than {MOST_NUMBERS:,} numbers")
+    require_network(width=width, depth=2)
+    size: dict[str, Any] = {"width": field_width, "depth": field_depth, "activation": field_activation}
     # Explicit, so that a change of their defaults does not change stored models.
-    size["momentum_scale"] = 1.0
-    if name == "black-box-hnn":
-        model, slowed = make_black_box_hamiltonian(NEEDS, **size), _slowed_energy
+    size |= {"momentum_scale": 1.0, "dtype": dtype}
+    if field == "black-box-hnn":
+        unit, slowed = make_black_box_hamiltonian(NEEDS, **size), _slowed_energy
     else:
-        model, slowed = make_phase_network(NEEDS, **size, rate_scale=1.0), _slowed_rates
-    return Model(model.init, lambda parameters: slowed(model.energies(parameters), momentum_scale))
+        unit, slowed = make_phase_network(NEEDS, **size, rate_scale=1.0), _slowed_rates
+    dynamics = Model(unit.init, lambda parameters: slowed(unit.energies(parameters), momentum_scale))
+    encoder = _residual_network("encoder", width, 1, activation)
+    decoder = _residual_network("decoder", width, components, activation)
+
+    def init(key: Array) -> Any:
+        first, second, third = jax.random.split(key, 3)
+        networks = {
+            "encoder": encoder.init(first, jnp.zeros((2, components), dtype)),
+            "decoder": decoder.init(second, jnp.zeros((2, 1), dtype)),
+            "field": dynamics.init(third),
+        }
+        shapes = {"mean": (pixels,), "basis": (components, pixels), "scale": ()}
+        return {
+            "parameters": networks,
+            "components": {name: jnp.ones(shape, dtype) for name, shape in shapes.items()},
+        }
+
+    def coefficients(networks: Any, scale: float | Array) -> LatentPhase:
+        def encode(c: Float[Array, " 2C"]) -> tuple[Latent, Latent]:
+            z = encoder.apply(networks["encoder"], c.reshape(2, components) / scale)
+            return z[0], z[1] - z[0]
+
+        def decode(q: Latent, p: Latent) -> Float[Array, " 2C"]:
+            return (scale * decoder.apply(networks["decoder"], jnp.stack([q, q + p]))).ravel()
+
+        return LatentPhase(encode, decode, flow(dynamics.energies(networks["field"]), degrees_of_freedom=1))
+
+    def images(parameters: Any) -> LatentPhase:
+        mean, basis, scale = (parameters["components"][name] for name in ("mean", "basis", "scale"))
+        inner = coefficients(parameters["parameters"], scale)
+
+        def encode(frames: Float[Array, " 2n"]) -> tuple[Latent, Latent]:
+            (pair,) = vectors(2 * pixels, frames=frames)
+            return inner.encode(((pair.reshape(2, pixels) - mean) @ basis.T).ravel())
+
+        def decode(q: Latent, p: Latent) -> Float[Array, " 2n"]:
+            q, p = vectors(1, q=q, p=p)
+            return (mean + inner.decode(q, p).reshape(2, components) @ basis).ravel()
+
+        return LatentPhase(encode, decode, inner.field)
+
+    return ImageModel(init, images, coefficients, dynamics)
 
 
 # States and rates of the models are of order 1; their motions take 1 / rate frames per unit of the models' time. With
@@ -118,115 +170,11 @@ def _slowed_rates(system: PhaseRates, rate: float) -> PhaseRates:
     return PhaseRates(rates)
 
 
-def make_latent_phase(
-    field: Model,
-    count: int,
-    *,
-    scale: float = 0.2,
-    width: int = 200,
-    activation: Activation | str = silu,
-    dtype: DTypeLike = jnp.float32,
-) -> LatentModel:
-    """Returns the (init, apply) pair of an autoencoder with a phase model of one coordinate in its latent plane.
+def _residual_network(name: str, width: int, outputs: int, activation: Activation) -> hk.Transformed:
+    def network(x: Float[Array, "rows inputs"]) -> Float[Array, "rows outputs"]:
+        h = activation.value(hk.Linear(width, name=f"{name}_1")(x))
+        for layer in range(2, LAYERS):
+            h = h + activation.value(hk.Linear(width, name=f"{name}_{layer}")(h))
+        return hk.Linear(outputs, name=f"{name}_{LAYERS}")(h)
 
-    Args:
-        field: model of the latent plane, from `latent_field`.
-        count: number of values per frame, n / 2; the values have mean zero.
-        scale: typical size of the values.
-        width: hidden units per layer of both networks.
-
-    Raises:
-        InputError: a number is not positive.
-    """
-    require_positive(count=count, scale=scale)
-    require_network(width=width, depth=2)
-    activation = activation_of(activation)
-
-    @hk.without_apply_rng
-    @hk.transform
-    def encoder(x: Float[Array, " n"]) -> tuple[Latent, Latent]:
-        z = _residual_network(x.reshape(2, -1) / scale, width, 1, activation, "encoder")
-        return z[0], z[1] - z[0]
-
-    @hk.without_apply_rng
-    @hk.transform
-    def decoder(q: Latent, p: Latent) -> Float[Array, " n"]:
-        return (scale * _residual_network(jnp.stack([q, q + p]), width, count, activation, "decoder")).ravel()
-
-    def init(key: Array) -> Parameters:
-        first, second, third = jax.random.split(key, 3)
-        z = jnp.zeros(1, dtype)
-        return {
-            "encoder": encoder.init(first, jnp.zeros(2 * count, dtype)),
-            "decoder": decoder.init(second, z, z),
-            "field": field.init(third),
-        }
-
-    def apply(parameters: Parameters) -> LatentPhase:
-        return LatentPhase(
-            functools.partial(encoder.apply, parameters["encoder"]),
-            functools.partial(decoder.apply, parameters["decoder"]),
-            flow(field.energies(parameters["field"]), degrees_of_freedom=1),
-        )
-
-    return LatentModel(init, apply, field)
-
-
-class Components(NamedTuple):
-    """An orthonormal basis of images."""
-
-    mean: Float[np.ndarray, " n"]
-    basis: Float[np.ndarray, "C n"]
-    scale: float
-    """Root mean square of a coefficient."""
-    lost: float
-    """Share of the variance outside the basis."""
-
-
-def principal_components(images: Float[np.ndarray, "*samples n"], count: int) -> Components:
-    """Returns the components with the largest variance.
-
-    Raises:
-        InputError: the count is outside 1..n.
-    """
-    n = images.shape[-1]
-    if not 1 <= count <= n:
-        raise InputError(f"components is {count}; expected 1 to {n}, the number of pixels")
-    flat = images.reshape(-1, n).astype(float)
-    mean = flat.mean(axis=0)
-    variances, vectors = np.linalg.eigh((flat - mean).T @ (flat - mean) / len(flat))
-    kept = variances[-count:].sum()
-    return Components(mean, vectors[:, ::-1][:, :count].T, float(np.sqrt(kept / count)), 1 - kept / variances.sum())
-
-
-def compress(components: Components, images: Float[np.ndarray, "*samples n"]) -> Float[np.ndarray, "*samples C"]:
-    """Returns the coefficients of images, in the dtype of the images."""
-    return ((images - components.mean) @ components.basis.T).astype(images.dtype)
-
-
-def through_components(model: LatentModel, components: Components) -> LatentModel:
-    """Turns a model of principal components into a model of images with the same parameters."""
-
-    def apply(parameters: Parameters) -> LatentPhase:
-        inner = model.apply(parameters)
-
-        def encode(x: Float[Array, " n"]) -> tuple[Latent, Latent]:
-            mean, basis = (jnp.asarray(array, x.dtype) for array in components[:2])
-            return inner.encode(((x.reshape(2, -1) - mean) @ basis.T).ravel())
-
-        def decode(q: Latent, p: Latent) -> Float[Array, " n"]:
-            mean, basis = (jnp.asarray(array, q.dtype) for array in components[:2])
-            return (mean + inner.decode(q, p).reshape(2, -1) @ basis).ravel()
-
-        return LatentPhase(encode, decode, inner.field)
-
-    return LatentModel(model.init, apply, model.field)
-
-
-def _residual_network(
-    x: Float[Array, "rows inputs"], width: int, outputs: int, activation: Activation, name: str
-) -> Float[Array, "rows outputs"]:
-    h = activation.value(hk.Linear(width, name=f"{name}_1")(x))
-    for layer in range(2, LAYERS):
-        h = h + activation.value(hk.Linear(width, name=f"{name}_{layer}")(h))
-    return hk.Linear(outputs, name=f"{name}_{LAYERS}")(h)
+    return hk.without_apply_rng(hk.transform(network))

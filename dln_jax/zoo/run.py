@@ -15,14 +15,13 @@ from dln_jax.files import is_file
 from dln_jax.mechanics import equations
 from dln_jax.mechanics.dynamics import Dynamics, Flow, InverseForward, PhaseRates, PlainDynamics, PlainFlow
 from dln_jax.models import uncertainty as uncertainties
-from dln_jax.models.latent_phase import LatentPhase
+from dln_jax.models.differential_network import Derivatives, FunctionModel
+from dln_jax.models.latent_phase import ImageModel, LatentPhase
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.uncertainty import Uncertainty, predictive
 from dln_jax.precision import data_type, require_double_precision
 from dln_jax.types import InputError, VectorLike
 from dln_jax.zoo.descriptions import OWN, Description, build
-from dln_jax.zoo.differential_network import Derivatives, FunctionModel
-from dln_jax.zoo.images import ImageModel
 from dln_jax.zoo.parameter_files import MODEL, REMEDY, VALUE, load_manifest, load_tree, require_fitting, save_tree
 from dln_jax.zoo.uncertainty_files import discard_uncertainty, load_uncertainty
 

@@ -54,7 +54,7 @@ OPTIONS = {
     ],
     train_hnn: ["--width 1000000000", "--data data.npz --depth 5000"],
     train_hnn_task: ["--width 1000000000", "--task measured --data free.npz --depth 5000"],
-    train_diffnet: ["--width 1000000000", "--depth 5000", "--samples 1000000000", "--samples 1", "--noise inf"],
+    train_diffnet: ["--width 1000000000", "--depth 5000", "--samples 1000000000", "--samples 1"],
     train_value: ["--width 1000000000", "--members 1000000000", "--starts 1000000000"],
     train_locomotion: ["--upright inf"],
     simulate: [

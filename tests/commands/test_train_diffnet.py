@@ -1,7 +1,5 @@
 """The command line of differential networks end to end on a tiny budget: what it writes, and what it refuses."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,14 +8,13 @@ from calls import assert_refused, command, exit_status, json_of, refused
 
 from dln_jax import load
 from dln_jax.commands import train_diffnet
+from dln_jax.commands.functions.errors import verdict_of
 from dln_jax.data import functions
+from dln_jax.learning import functions as regression
 from dln_jax.learning.engine import checkpoint
 from dln_jax.learning.engine import fit as engine_fit
 from dln_jax.learning.functions import Network
 from dln_jax.metrics.verdict import LEVELS
-from dln_jax.training.functions import run as function_runs
-from dln_jax.training.functions import task as function_task
-from dln_jax.training.functions.run import verdict_of
 
 SMALL = "--samples 200 --width 4"
 ADAM = f"{SMALL} --optimizer adam --epochs 2 --batch 64"
@@ -60,7 +57,7 @@ def test_a_default_run_writes_all_its_files_and_the_model_can_be_loaded(workplac
     assert (config["function"], config["optimizer"]) == ("sin", "gauss-newton")
     assert (config["chosen"]["width"], config["chosen"]["precision"]) == (4, "f64")
     assert metrics["verdict"] == LEVELS.index(config["chosen"]["verdict"]["level"])
-    grid = functions.sine_grid()
+    grid = functions.published_grid("sin")
     answers = jax.vmap(load(folder).derivatives)(grid.x)
     np.testing.assert_allclose(np.mean((answers.hessian - grid.d2y) ** 2), metrics["hessian_mse"], rtol=1e-6)
     out = capsys.readouterr().out
@@ -79,8 +76,7 @@ def test_verdict_counts_every_component_of_what_was_fitted():
 
 
 def test_adam_on_two_inputs_with_an_ensemble_shows_its_spread_outside_the_data(workplace, monkeypatch):
-    coarse = partial(functions.cosine_sine_grid, points=9)
-    monkeypatch.setitem(function_task.NAMED, "cos_sin", (functions.cosine_sine, coarse))
+    monkeypatch.setitem(functions.PUBLISHED, "cos_sin", (functions.cosine_sine, 2, 9))
     command(train_diffnet, ADAM, "--function cos_sin --ensemble 3 --out run")
     assert names_in(workplace / "run") == FILES | {"ensemble.png", "heat_maps.png", "surfaces.png", "training.png"}
     metrics = json_of(workplace / "run/metrics.json")
@@ -110,7 +106,7 @@ def test_relu_is_told_that_its_hessian_is_useless(workplace, capsys):
     assert names_in(workplace / "run") == FILES
     # What predicting zero gets: the mean of sin² over the grid.
     assert json_of(workplace / "run/metrics.json")["hessian_mse"] == pytest.approx(
-        np.mean(functions.sine_grid().d2y ** 2)
+        np.mean(functions.published_grid("sin").d2y ** 2)
     )
 
 
@@ -118,8 +114,8 @@ def test_relu_is_told_that_its_hessian_is_useless(workplace, capsys):
 def test_an_interrupted_run_resumes_bit_for_bit(workplace, monkeypatch, capsys):
     """Stopped after a few reports, and continued: the width is chosen again."""
     own_file("mine.npz")
-    wanted = "--function mine.npz --loss type2 --depth 1 --steps 12 --coarse-steps 6 --no-figures"
-    monkeypatch.setattr(function_runs, "WIDTHS", (2,))
+    wanted = "--function mine.npz --loss type2 --depth 1 --steps 12 --no-figures"
+    monkeypatch.setattr(regression, "WIDTHS", (2,))
     command(train_diffnet, wanted, "--out unbroken")
     store = checkpoint.store
 
@@ -150,7 +146,6 @@ MISTAKES = {
     "--samples 5": "--samples is an option of --function sin and cos_sin",
     "--function none.npz": "no such file",
     "--function tan": "expected sin, cos_sin or an npz file",
-    "--function sin --noise -1": "noise is -1",
 }
 
 

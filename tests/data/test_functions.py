@@ -8,18 +8,18 @@ from calls import one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax import fit
+from dln_jax.commands.functions.errors import errors, predict
+from dln_jax.commands.functions.units import layers_in_own_units, standard_units, to_units
 from dln_jax.data import functions
-from dln_jax.data.functions import FunctionSamples
+from dln_jax.data.functions import FunctionSamples, published, published_grid
 from dln_jax.learning import functions as regression
 from dln_jax.learning.functions import Network, mean_loss, published_adam, targets
-from dln_jax.learning.standardisation import layers_in_own_units, standard_units, to_units
-from dln_jax.metrics.functions import errors, predictions, typical_spread
 from dln_jax.nn import ensembles
 from dln_jax.nn.activations import cos, tanh
 
 CASES = (
-    (functions.sine, functions.sine_grid, 100, lambda x: jnp.sin(x[0])),
-    (functions.cosine_sine, functions.cosine_sine_grid, 2500, lambda x: jnp.cos(x[0]) * jnp.sin(x[1])),
+    ("sin", 100, lambda x: jnp.sin(x[0])),
+    ("cos_sin", 2500, lambda x: jnp.cos(x[0]) * jnp.sin(x[1])),
 )
 
 
@@ -38,13 +38,13 @@ def exact(function, x):
 
 
 def test_grids_are_exact_and_samples_have_the_published_noise_on_everything():
-    for generate, grid, points, function in CASES:
-        test = grid()
+    for name, points, function in CASES:
+        test = published_grid(name)
         assert len(test.x) == points
         assert_allclose([test.x.min(), test.x.max()], [-np.pi, np.pi])
         for ours, theirs in zip(test, exact(function, test.x), strict=True):
             assert_allclose(ours, theirs, atol=1e-14)
-        noisy, clean = generate(), generate(noise=0.0)
+        noisy, clean = published(name), published(name, noise=0.0)
         assert noisy.x.shape == (25_600, test.x.shape[1])
         true = exact(function, clean.x)
         for key, ours, truth in zip(FunctionSamples._fields, noisy, true, strict=True):
@@ -59,7 +59,7 @@ def test_grids_are_exact_and_samples_have_the_published_noise_on_everything():
 
 
 def test_generators_follow_their_seed_and_bound():
-    one, same, other = (functions.cosine_sine(samples=500, seed=seed, bound=2.0).x for seed in (3, 3, 4))
+    one, same, other = (published("cos_sin", samples=500, seed=seed, bound=2.0).x for seed in (3, 3, 4))
     assert_array_equal(one, same)
     assert abs(one - other).max() > 0.1 and 1.9 < abs(one).max() < 2.01
 
@@ -90,14 +90,14 @@ def test_what_does_not_fit_is_named():
     ):
         with one_line(message):
             functions.from_arrays(content)
+    with one_line("noise is -1"):
+        published("sin", noise=-1)
 
 
 def test_a_split_has_every_sample_once():
-    data = functions.sine(samples=101, noise=0.0)
+    data = published("sin", samples=101, noise=0.0)
     train, validation = functions.split(data, seed=1)
     assert len(validation.x) == 10 and sorted([*train.x, *validation.x]) == sorted(data.x)
-    with one_line("share"):
-        functions.split(data, validation_share=1.0)
     assert_allclose(validation.dy[:, 0], np.cos(validation.x))
 
 
@@ -107,7 +107,7 @@ SINE = ((jnp.ones((1, 1)), jnp.array([-jnp.pi / 2])), (jnp.ones((1, 1)), jnp.zer
 
 def test_an_exact_model_has_no_loss_and_a_wrong_one_that_of_its_terms():
     for loss, derivative in (("type1", 1), ("type1", 2), ("type2", 2)):
-        grid = functions.sine_grid(points=50)
+        grid = published_grid("sin")
         batch = targets(grid, Network(loss=loss, derivative=derivative, precision="f64"))
         assert float(mean_loss(SINE, batch, activation=cos)) < 1e-30
         double = (SINE[0], (2 * SINE[1][0], SINE[1][1]))
@@ -124,33 +124,30 @@ def test_a_network_of_standard_units_is_the_same_in_the_users_units():
     assert_allclose(standard.y.mean(axis=0), 0, atol=1e-12)
     for sizes in ((3, 4, 2), (3, 2)):
         layers = ensembles.init(jax.random.key(0), sizes, members=1)
-        inner = predictions(layers, standard.x, activation=tanh).mean
-        outer = predictions(layers_in_own_units(layers, units), data.x, activation=tanh).mean
+        inner, _ = predict(layers, standard.x, activation=tanh)
+        outer, _ = predict(layers_in_own_units(layers, units), data.x, activation=tanh)
         for ours, theirs in zip(to_units(outer, units), inner, strict=True):
             assert_allclose(ours, theirs, rtol=1e-9, atol=1e-10)
     assert (standard_units(data._replace(x=np.ones((12, 3)))).x_size == 1).all()
 
 
 def test_errors_are_sums_over_components_and_ensembles_average():
-    truth = functions.cosine_sine_grid(points=5)
+    truth = published_grid("cos_sin")
     off = truth._replace(y=truth.y + 0.5, dy=truth.dy + np.array([0.3, 0.4]), d2y=truth.d2y + 1.0)
     assert errors(off, truth) == pytest.approx({"value_mse": 0.25, "gradient_mse": 0.25, "hessian_mse": 4.0})
     assert set(errors(off, truth._replace(d2y=None))) == {"value_mse", "gradient_mse"}
     layers = ensembles.init(jax.random.key(0), (2, 4, 1), members=3)
-    together = predictions(layers, truth.x, activation=tanh)
+    mean, spread = predict(layers, truth.x, activation=tanh)
     alone = [
-        predictions(jax.tree.map(lambda a, k=k: a[k : k + 1], layers), truth.x, activation=tanh).mean.d2y
-        for k in range(3)
+        predict(jax.tree.map(lambda a, k=k: a[k : k + 1], layers), truth.x, activation=tanh)[0].d2y for k in range(3)
     ]
-    assert_allclose(together.mean.d2y, np.mean(alone, axis=0), atol=1e-12)
-    assert_allclose(together.spread.d2y, np.std(alone, axis=0, ddof=1), atol=1e-12)
-    first = np.arange(25) < 5
-    assert_allclose(typical_spread(together.spread, first) ** 2, np.mean(together.spread.y[:5] ** 2))
+    assert_allclose(mean.d2y, np.mean(alone, axis=0), atol=1e-12)
+    assert_allclose(spread.d2y, np.std(alone, axis=0, ddof=1), atol=1e-12)
 
 
 def test_members_of_an_ensemble_train_as_if_alone():
     """Adam on the sum of losses moves each member as it would move by itself, on the same batches."""
-    sets = functions.split(functions.sine(samples=200))
+    sets = functions.split(published("sin", samples=200))
     settings = Network(width=3, members=2, precision="f64", activation="tanh")
     optimiser = published_adam(len(sets.train.x), epochs=4, batch=20)
     together = regression.train(sets, settings, optimiser)

@@ -60,7 +60,7 @@ LINES = {
         }.items()
     },
     "train_value": "train_value --plant pendulum --iterations 1 --width 8 --depth 1 --starts 4 --no-figures",
-    "train_diffnet": "train_diffnet --samples 50 --steps 2 --coarse-steps 0 --width 4 --depth 1 --no-figures",
+    "train_diffnet": "train_diffnet --samples 50 --steps 2 --width 4 --depth 1 --no-figures",
     "simulate-beam": "simulate --scene beam --cells 1 --seconds 0.05 --no-figures --precision f64",
     "train_locomotion": "train_locomotion --steps 64 --window 4 --episode 8 --width 4 --no-figures",
     "swing_up": "swing_up --plant cart-pole --model known --starts 2 --no-figures",

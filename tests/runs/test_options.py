@@ -9,6 +9,7 @@ from typing import get_args, get_type_hints
 
 from dln_jax.commands import COMMANDS, identify, train_delan, train_diffnet, train_hnn, train_hnn_task, train_value
 from dln_jax.control.optimal.plants import PLANTS
+from dln_jax.data.functions import PUBLISHED
 from dln_jax.learning.settings import WAYS
 from dln_jax.mechanics.friction.laws import LAWS, USUAL
 from dln_jax.nn.activations import ALL
@@ -16,8 +17,6 @@ from dln_jax.runs.arguments import arguments_for, resolved
 from dln_jax.runs.options import SCENES
 from dln_jax.scenes import registry
 from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS
-from dln_jax.training.functions import options as functions
-from dln_jax.training.functions.task import NAMED
 from dln_jax.training.hamiltonian import options as phase_spaces
 from dln_jax.zoo.catalogue import CATALOGUE
 
@@ -54,10 +53,10 @@ def test_names_and_defaults_in_options_are_those_of_the_library():
     assert set(SCENES) == set(registry.SCENES)
     assert set(WAYS) - {"auto"} <= set(CATALOGUE)
     assert set(phase_spaces.GENERATED) == set(PROTOCOLS)
-    assert set(functions.NAMES) == set(NAMED)
+    assert set(train_diffnet.NAMES) == set(PUBLISHED)
     assert set(identify.LAWS) == set(LAWS)
     assert shown(train_value.TrainingOptions, "plant") == {*PLANTS, "FILE"}
-    assert shown(functions.Learned, "activation") == set(ALL)
+    assert shown(train_diffnet.Arguments, "activation") == set(ALL)
     assert set(get_args(get_type_hints(phase_spaces.Motion)["model"])) - {"auto"} <= set(CATALOGUE)
     defaults = {field.name: field.default for field in dataclasses.fields(identify.Arguments)}
     assert defaults["friction"] == ",".join(USUAL)
@@ -70,7 +69,6 @@ def test_an_option_exists_for_the_choices_that_read_it():
         (train_delan, {"model": "trigonometric"}, "degree objective", "width seconds seeds"),
         (train_hnn_task, {}, "trajectories width", "data noise learning_rate degree"),
         (train_hnn_task, {"task": "measured"}, "data noise order", "trajectories field"),
-        (train_diffnet, {"optimizer": "adam"}, "epochs samples", "steps"),
         (train_value, {"stored": "run"}, "starts", "plant width seed"),
     ]:
         names = {field.name for field in dataclasses.fields(arguments_for(command.Arguments, stated))}

@@ -41,7 +41,8 @@ from dln_jax.mechanics.dynamics import Dynamics, Flow, PhaseRates, PlainFlow
 from dln_jax.mechanics.equations import Canonical, Driven, System, dynamics, flow
 from dln_jax.mechanics.jacobians import Natural
 from dln_jax.mechanics.joint_friction import LoadedSystem
-from dln_jax.models.latent_phase import LatentPhase
+from dln_jax.models.differential_network import FunctionModel
+from dln_jax.models.latent_phase import ImageModel, LatentPhase
 from dln_jax.models.model import Model
 from dln_jax.models.uncertainty import Uncertainty, out_of_distribution, predictive
 from dln_jax.nn import differential_mlp
@@ -51,8 +52,6 @@ from dln_jax.precision import data_type
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build
-from dln_jax.zoo.differential_network import FunctionModel
-from dln_jax.zoo.images import ImageModel
 from dln_jax.zoo.run import Run
 
 Function = Callable[..., Mapping[str, Array]]

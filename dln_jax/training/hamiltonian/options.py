@@ -1,4 +1,4 @@
-"""Options of Hamiltonian trainings in a phase space and of images. Importing them does not import JAX."""
+"""Options of Hamiltonian trainings in a phase space. Importing them does not import JAX."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -167,22 +167,3 @@ VARIANTS = Variants(
         MeasuredOptions: "--task measured",
     },
 )
-
-
-@dataclass(frozen=True)
-class Images:
-    """Films of a pendulum, and what is learned from them."""
-
-    model: Literal["black-box-hnn", "phase-network"] = "black-box-hnn"
-    """An energy in the latent plane, or a network that gives the rates there."""
-    trajectories: Unstated[int] = None
-    """Generated films (default: as published)."""
-    steps: Unstated[int] = None
-    """Steps of adam (default: those of the published recipe)."""
-    seed: int = 0
-    """Seed of parameters and shuffling."""
-
-
-@dataclass(frozen=True)
-class ImageOptions(Drawn, Resumable, Images):
-    """What to train on, how, and where the results go."""

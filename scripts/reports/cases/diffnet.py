@@ -12,10 +12,9 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from dln_jax.data import functions
-from dln_jax.data.functions import FunctionSamples, SampleSplit
+from dln_jax.commands.functions.errors import errors, predict
+from dln_jax.data.functions import FunctionSamples, SampleSplit, published, published_grid, split
 from dln_jax.learning.functions import GAUSS_NEWTON, WIDTHS, Network, grow_width, published_adam, train
-from dln_jax.metrics.functions import errors, predictions
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import activation as activation_named
 from dln_jax.nn.activations import tanh
@@ -50,9 +49,7 @@ BEST = {name: [min(row[i] for key, row in PUBLISHED.items() if key[0] == name) f
 @functools.cache
 def samples_of(function: str, samples: int, seed: int) -> tuple[SampleSplit, FunctionSamples]:
     """Noisy samples of a published function, split, and its clean grid."""
-    sine = function == "sin"
-    data = (functions.sine if sine else functions.cosine_sine)(samples=samples, seed=seed)
-    return functions.split(data, seed=seed), functions.sine_grid() if sine else functions.cosine_sine_grid()
+    return split(published(function, samples=samples, seed=seed), seed=seed), published_grid(function)
 
 
 def measure_function(
@@ -78,9 +75,9 @@ def measure_function(
         small = network._replace(width=WIDTHS[0], precision="f64")
         chosen, _ = grow_width(sets, small, lambda candidate: train(sets, candidate, optimiser))
         network, training = chosen.candidate, chosen.outcome
-    predicted = predictions(training.parameters, test.x, activation=activation_named(activation))
+    predicted, _ = predict(training.parameters, test.x, activation=activation_named(activation))
     seconds = time.perf_counter() - began
-    numbers = {**errors(predicted.mean, test), "width": network.width, "job_seconds": seconds}
+    numbers = {**errors(predicted, test), "width": network.width, "job_seconds": seconds}
     return {f"{function}/{loss}/{activation}/{optimizer}": numbers}
 
 

@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from dln_jax.commands.pixels.fit import fit, measure
+from dln_jax.commands.pixels.frames import TRAJECTORIES, swinging_rod
 from dln_jax.metrics.phase_space import Motions, motion_errors, predict
 from dln_jax.models.latent_phase import Field
-from dln_jax.training.hamiltonian import pixels
 from dln_jax.training.hamiltonian.model_selection import POLYNOMIAL, choose_model, description_of
 from dln_jax.training.hamiltonian.predictions import measured_once
 from dln_jax.training.hamiltonian.recipes import RECIPES
@@ -78,10 +79,10 @@ def measured(problem: Problem, seeds: int, steps: int | None) -> Numbers:
 
 def images(*, seeds: int = 3, steps: int | None = None, trajectories: int | None = None) -> Numbers:
     """Models of images."""
-    data, numbers = pixels.pixel_data(trajectories), {}
+    (*fitted, test), numbers = swinging_rod(trajectories or TRAJECTORIES), {}
     for kind in MODELS:
-        runs = [pixels.measure_pixels(kind, data, seed=seed, steps=steps)[0] for seed in range(seeds)]
-        numbers[f"pixels/{kind}"] = medians(runs)
+        fits = (fit(kind, *fitted, seed=seed, steps=steps) for seed in range(seeds))
+        numbers[f"pixels/{kind}"] = medians([measure(*one, test)[0] for one in fits])
     energetic, baseline = numbers.values()
     energetic["energy_mse_over_baseline"] = energetic["energy_mse"] / baseline["energy_mse"]
     return numbers

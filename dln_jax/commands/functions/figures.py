@@ -1,5 +1,7 @@
 """Figures of learned functions: value, gradient and Hessian of truth and model with errors; spread of ensembles."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -10,6 +12,10 @@ from matplotlib.patches import Rectangle
 
 from dln_jax.data.functions import FunctionSamples
 from dln_jax.figures import style
+from dln_jax.figures.training import training_curve
+from dln_jax.learning.engine.problem import Training, one_after_the_other
+from dln_jax.learning.select import Trial
+from dln_jax.training.results import OF_LOSSES
 
 MODEL = style.colour("differential-network")
 HALO = {"color": "black", "linewidth": 3.0, "alpha": 0.3}
@@ -18,6 +24,16 @@ SIGNED, POSITIVE = "RdBu_r", "viridis"
 MOST_OUTPUTS = 4
 """Largest number of outputs shown."""
 TITLES = {"y": "value", "dy": "gradient", "d2y": "Hessian"}
+SYMBOLS = {"y": "$f$", "dy": "$f'$", "d2y": "$f''$"}
+COMPONENTS = {
+    "$f$": ("y",),
+    r"$\partial f / \partial x_1$": ("dy", 0),
+    r"$\partial f / \partial x_2$": ("dy", 1),
+    r"$\partial^2 f / \partial x_1\partial x_1$": ("d2y", 0, 0),
+    r"$\partial^2 f / \partial x_1\partial x_2$": ("d2y", 0, 1),
+    r"$\partial^2 f / \partial x_2\partial x_2$": ("d2y", 1, 1),
+}
+"""Components of a function of two inputs: field of the samples, and indices of the first output."""
 
 
 def _keys(data: FunctionSamples) -> list[str]:
@@ -38,8 +54,7 @@ def function_curves(truth: FunctionSamples, predicted: FunctionSamples) -> Figur
             upper.plot(x, model, color=MODEL, linewidth=1.2, label="model")
             error, power = _scaled(model - exact)
             lower.plot(x, error, color=MODEL, linewidth=0.9)
-            symbol = {"y": "$f$", "dy": "$f'$", "d2y": "$f''$"}[key]
-            upper.set_ylabel(symbol if truth.outputs == 1 else f"{symbol}, output {output + 1}")
+            upper.set_ylabel(SYMBOLS[key] if truth.outputs == 1 else f"{SYMBOLS[key]}, output {output + 1}")
             lower.set_ylabel(f"error{power}")
         style.title(column[0], TITLES[key])
         column[-1].set_xlabel("$x$")
@@ -49,30 +64,23 @@ def function_curves(truth: FunctionSamples, predicted: FunctionSamples) -> Figur
 
 
 def heat_maps(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
-    """Maps of a function of two inputs on a square grid (first output): truth, model and error of every component."""
-    places = range(truth.inputs)  # the Hessian is symmetric
-    indices = {"y": [()], "dy": [(i,) for i in places], "d2y": [(i, j) for i in places for j in places[i:]]}
-    components = [(key, index) for key in _keys(truth) for index in indices[key]]
-    height = 0.9 + 3.6 * min(1.0, 6 / len(components))
-    figure, axes = style.figure(3, len(components), height=height, sharex=True, sharey=True)
+    """Maps of a function of two inputs on a square grid: truth, model and error of every component."""
+    figure, axes = style.figure(3, len(COMPONENTS), height=4.5, sharex=True, sharey=True)
     grid = [_square(column) for column in truth.x.T]
-    for column, (key, index) in zip(axes.T, components, strict=True):
+    for column, (symbol, (key, *index)) in zip(axes.T, COMPONENTS.items(), strict=True):
         exact, model = (_square(getattr(data, key)[(slice(None), 0, *index)]) for data in (truth, predicted))
         error, power = _scaled(model - exact)
         largest, largest_error = (float(np.abs(values).max()) or 1e-300 for values in ([exact, model], error))
-        for axis, values, size in zip(column, (exact, model, error), (largest, largest, largest_error), strict=True):
+        rows = (exact, largest, None), (model, largest, ""), (error, largest_error, power.strip(", "))
+        for axis, (values, size, label) in zip(column, rows, strict=True):
             norm = Normalize(-size, size)
             axis.pcolormesh(*grid, values, norm=norm, cmap=SIGNED, rasterized=True)
             axis.set_aspect("equal")
             axis.grid(False)
-            if axis is not column[0]:
-                bar = _colour_bar(
-                    figure, axis, norm, SIGNED, label=power.removeprefix(", ") if axis is column[2] else ""
-                )
+            if label is not None:
+                bar = _colour_bar(figure, axis, norm, SIGNED, label=label)
                 tick = float(f"{0.7 * size:.0e}")
                 bar.set_ticks([-tick, tick], labels=[f"{-tick:g}", f"{tick:g}"])
-        below = "".join(rf"\partial x_{i + 1}" for i in index)
-        symbol = rf"$\partial{'^2' * (len(index) == 2)} f / {below}$" if index else "$f$"
         style.title(column[0], symbol, fontsize=11)
         column[2].set_xlabel("$x_1$")
     for axis, name in zip(axes[:, 0], ("truth", "model", "error"), strict=True):
@@ -82,24 +90,26 @@ def heat_maps(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
 
 def surfaces(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
     """Surfaces of a function of two inputs, in rows: value, norm of the gradient and trace of the Hessian."""
-    keys = _keys(truth)
-    names = {"y": "$f$", "dy": r"$|\nabla f|$", "d2y": r"trace $\nabla^2 f$"}
-    scalars = {"y": np.asarray, "dy": lambda dy: np.linalg.norm(dy, axis=1), "d2y": lambda d2y: d2y.trace(0, 1, 2)}
-    figure = style.blank(height=0.2 + 2.3 * len(keys))
+    scalars = {
+        "$f$": lambda data: data.y[:, 0],
+        r"$|\nabla f|$": lambda data: np.linalg.norm(data.dy[:, 0], axis=1),
+        r"trace $\nabla^2 f$": lambda data: data.d2y[:, 0].trace(0, 1, 2),
+    }
+    figure = style.blank(height=7.1)
     grid = [_square(column) for column in truth.x.T]
-    for row, key in enumerate(keys):
-        exact, model = (_square(scalars[key](getattr(data, key)[:, 0])) for data in (truth, predicted))
+    for row, (name, scalar) in enumerate(scalars.items()):
+        exact, model = (_square(scalar(data)) for data in (truth, predicted))
         error, power = _scaled(abs(model - exact))
         limits = float(np.min([exact, model])), float(np.max([exact, model]))
         panels = [(exact, "truth", limits), (model, "model", limits)]
         panels += [(error, f"|error|{power}", (0.0, float(error.max()) or 1.0))]
         for column, (values, text, limits) in enumerate(panels):
-            colours = POSITIVE if key == "dy" or column == 2 else SIGNED
-            axis = figure.add_subplot(len(keys), 3, 3 * row + column + 1, projection="3d")
+            colours = POSITIVE if row == 1 or column == 2 else SIGNED
+            axis = figure.add_subplot(len(scalars), 3, 3 * row + column + 1, projection="3d")
             look = {"cmap": colours, "norm": Normalize(*limits), "linewidth": 0, "antialiased": False}
             axis.plot_surface(*grid, values, rcount=50, ccount=50, **look)  # type: ignore[attr-defined]
             axis.set_zlim(*limits)  # type: ignore[attr-defined]
-            style.title(axis, f"{names[key]}, {text}", y=0.98)
+            style.title(axis, f"{name}, {text}", y=0.98)
             for label in (axis.set_xlabel("$x_1$", labelpad=-8), axis.set_ylabel("$x_2$", labelpad=-8)):
                 label.set_fontsize(style.SMALL)
             axis.tick_params(labelsize=6.5, pad=-3)
@@ -125,19 +135,12 @@ def parity(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
     return figure
 
 
-def ensemble(truth: FunctionSamples, mean: FunctionSamples, spread: FunctionSamples, *, bound: float) -> Figure:
-    """An ensemble of functions of one or two inputs, inside and outside the training data in [-bound, bound].
+def ensemble_curves(truth: FunctionSamples, mean: FunctionSamples, spread: FunctionSamples, bound: float) -> Figure:
+    """An ensemble of functions of one input, inside and outside the training data in [-bound, bound].
 
-    With one input: mean and two standard deviations, and below them spread and error on a logarithmic scale (for a
-    well-trained ensemble the band above is a line). With two: maps of the spread (root of the sum of squares over
-    components) with the box of the training data, logarithmic if the spread covers a decade.
+    Mean and two standard deviations, and below them spread and error on a logarithmic scale: for a well-trained
+    ensemble the band above is a line.
     """
-    if truth.inputs == 1:
-        return _ensemble_curves(truth, mean, spread, bound=bound)
-    return _ensemble_maps(spread, bound=bound)
-
-
-def _ensemble_curves(truth: FunctionSamples, mean: FunctionSamples, spread: FunctionSamples, *, bound: float) -> Figure:
     figure, axes = style.figure(2, 3, height=4.4, sharex=True, height_ratios=(3, 2))
     x = truth.x[:, 0]
     for (upper, lower), (key, text) in zip(axes.T, TITLES.items(), strict=True):
@@ -163,7 +166,9 @@ def _ensemble_curves(truth: FunctionSamples, mean: FunctionSamples, spread: Func
     return figure
 
 
-def _ensemble_maps(spread: FunctionSamples, *, bound: float) -> Figure:
+def ensemble_maps(spread: FunctionSamples, bound: float) -> Figure:
+    """Maps of the spread of functions of two inputs (root of the sum of squares over components), with the box of the
+    training data; logarithmic if the spread covers a decade."""
     figure, axes = style.figure(1, 3, height=3.4, sharey=True)
     grid = [_square(column) for column in spread.x.T]
     for axis, (key, text) in zip(axes[0], TITLES.items(), strict=True):
@@ -199,3 +204,20 @@ def _scaled(values: np.ndarray) -> tuple[np.ndarray, str]:
     size = float(np.abs(values).max())
     exponent = int(np.floor(np.log10(size))) if size > 0 and np.isfinite(size) else 0
     return (values, "") if -2 <= exponent <= 2 else (values / 10.0**exponent, rf", $10^{{{exponent}}}$")
+
+
+def training_figure(training: Training, trials: Sequence[Trial]) -> Figure:
+    """Losses of the training, or of all widths tried, one after the other."""
+    histories, before = [training.history], 0
+    if trials:
+        histories = [
+            [at._replace(stage=f"width {trial.candidate.width}") for at in trial.outcome.history] for trial in trials
+        ]
+        chosen = next(number for number, trial in enumerate(trials) if trial.outcome is training)
+        before = sum(history[-1].step for history in histories[:chosen])
+    return training_curve(
+        one_after_the_other(histories),
+        best_step=before + training.best_step,
+        unit="loss, in the units of the fit",
+        **OF_LOSSES,
+    )

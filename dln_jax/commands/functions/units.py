@@ -26,12 +26,6 @@ class Units(NamedTuple):
     """[m]"""
 
 
-def own_units(data: FunctionSamples) -> Units:
-    """Returns units that leave the data unchanged."""
-    n, m = data.inputs, data.outputs
-    return Units(np.zeros(n), np.ones(n), np.zeros(m), np.ones(m))
-
-
 def standard_units(data: FunctionSamples) -> Units:
     """Returns the means and standard deviations of the columns; a column that does not vary has size 1.
 

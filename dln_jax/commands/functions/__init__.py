@@ -1,0 +1,1 @@
+"""Differential networks for functions: units of the fit, errors and verdict, and figures."""

@@ -1,1 +1,0 @@
-"""Trains differential networks on functions."""
