@@ -59,20 +59,25 @@ class TrainingOptions:
     """Number of trainings; the best in validation is kept."""
 
 
-def options_of(stated: Mapping[str, Any]) -> tuple[type, ...]:
-    """Options of the training, which a stored value function does not need."""
-    return () if stated.get("stored") else (TrainingOptions,)
+def class_of(stated: Mapping[str, Any]) -> type:
+    """All options, or those that a stored value function needs."""
+    return Arguments if stated.get("stored") else Training
 
 
 @dataclass(frozen=True)
 class Arguments(Scaled, Drawn, Resumable):
     """Plant, method, and where the results go."""
 
-    VARIANTS: ClassVar = Variants(options_of, {TrainingOptions: "a training, without --stored"})
+    VARIANTS: ClassVar = Variants(class_of, {TrainingOptions: "a training, without --stored"})
     starts: int = 100
     """Number of starts in the evaluation, both hanging and anywhere."""
     stored: Unstated[Path] = None
     """Folder of a run whose value function is evaluated on its plant; nothing is trained (default: train one)."""
+
+
+@dataclass(frozen=True)
+class Training(TrainingOptions, Arguments):
+    """A training, and where the results go."""
 
 
 def main(options: Arguments) -> None:

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
-from dln_jax.learning.select import Trial, select, significantly_better
+from dln_jax.learning.select import Trial, betters, select
 from dln_jax.models.model import Model, Parameters, linearised
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
@@ -197,7 +197,7 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
         while chosen.candidate[joint] > 0:
             fewer = tuple(n - (place == joint) for place, n in enumerate(chosen.candidate))
             trials.append(Trial(fewer, *fit(fewer)))
-            if trials[-1].validation > target and significantly_better(chosen.errors, trials[-1].errors):
+            if trials[-1].validation > target and betters(chosen, trials[-1]):
                 break
             chosen = trials[-1]
     return chosen, trials

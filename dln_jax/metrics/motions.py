@@ -27,8 +27,7 @@ from jaxtyping import Array, Float, Int
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import GAP
-from dln_jax.learning.shooting import START_STEPS, MeasuredWindows, nearest
-from dln_jax.learning.shooting import motion as phase_motion
+from dln_jax.learning.shooting import START_STEPS, MeasuredWindows, nearest, phase_motion
 from dln_jax.mechanics.discrete import Torque, driven, torque_slopes
 from dln_jax.mechanics.dynamics import Dynamics, InverseForward, PlainDynamics
 from dln_jax.mechanics.equations import dynamics, flow

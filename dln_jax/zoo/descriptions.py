@@ -108,14 +108,15 @@ def build(description: Description, *, factory: Callable[..., Any] | None = None
         raise InputError(f"model description: name is {reprlib.repr(name)}, expected that of a model; {REMEDY}")
     if factory is None and name in CATALOGUE:
         try:
-            return _catalogued(json.dumps(description))
+            return catalogued(json.dumps(description))
         except (TypeError, ValueError):  # values that JSON does not have, which are refused below
             pass
     return _built(description, functions_of(name, factory, trust=trust))
 
 
 @functools.lru_cache(maxsize=16)
-def _catalogued(text: str) -> Any:
+def catalogued(text: str) -> Any:
+    """Builds the model of a description in JSON, and keeps it."""
     description = json.loads(text)
     return _built(description, functions_of(description["name"]))
 

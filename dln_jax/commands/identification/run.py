@@ -9,6 +9,13 @@ import jax
 import numpy as np
 from jax import Array
 
+from dln_jax.commands.identification.motions import (
+    choose_window,
+    lightly_filtered,
+    prediction_times,
+    refit,
+    spread_of,
+)
 from dln_jax.commands.identification.verdict import Predict, judge_robot
 from dln_jax.commands.identify import LAWS, NO_FRICTION, TEMPERATURE, Arguments
 from dln_jax.compilation import quick_compilation
@@ -45,13 +52,6 @@ from dln_jax.runs.evaluation import bands_of
 from dln_jax.runs.logs import facts
 from dln_jax.runs.report import Report, finish, png
 from dln_jax.runs.stored_arguments import command_folder
-from dln_jax.training.identification.motions import (
-    choose_window,
-    lightly_filtered,
-    prediction_times,
-    refit,
-    spread_of,
-)
 from dln_jax.types import FrictionLaw, InputError
 from dln_jax.zoo.descriptions import Description
 

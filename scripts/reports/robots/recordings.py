@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from dln_jax import Model, Trajectories, Tree, read_robot
+from dln_jax.commands.identification.motions import choose_window, refit
 from dln_jax.data import schema
 from dln_jax.data.encoders.filters import low_pass
 from dln_jax.data.encoders.smoothing import TRIMMED, smooth
@@ -26,7 +27,6 @@ from dln_jax.models.model import Parameters
 from dln_jax.models.trees import make_rigid_tree, tree_of
 from dln_jax.models.trigonometric import make_planar_chain
 from dln_jax.solvers import least_squares
-from dln_jax.training.identification.motions import choose_window, refit
 from dln_jax.types import FrictionLaw, InputError, Needs
 from scripts.reports.robots.arm import Torque, error_of, regression, torque_of
 from scripts.reports.robots.known_kinematics import USUAL_SCALE

@@ -1,6 +1,5 @@
 """Every check finds the fault that is planted, names its joint, and is silent on data without it."""
 
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,1 +1,0 @@
-"""Fits to motions, which identify and learned trees share."""
