@@ -108,21 +108,20 @@ PACKAGES = {
 
 PUBLIC = {
     "Basic": {
+        "From a log to a model": ["read_log", "train", "identify", "evaluate", "load", "save"],
         "Energies and equations of motion": [
-            "LagrangianSystem", "NaturalSystem", "HamiltonianSystem", "NaturalHamiltonian", "dynamics", "flow",
-            "Dynamics", "Flow", "Decomposition",
+            "LagrangianSystem", "NaturalSystem", "HamiltonianSystem", "NaturalHamiltonian", "dynamics", "flow", "Needs",
         ],
-        "Data": ["load_trajectories", "save_trajectories", "Trajectories", "Needs"],
-        "Models and training": ["make_delan", "Model", "fit", "GaussNewton", "Adam", "Problem", "Training"],
-        "Runs": ["load", "save", "Run", "build", "describe"],
+        "Models and training": [
+            "model_names", "make", "make_delan", "Model", "fit", "GaussNewton", "Adam", "Problem",
+        ],
         "Deployment": ["export_c", "load_c", "low_latency", "enable_low_latency"],
         "Errors": ["InputError"],
     },
     "Advanced": {
-        "Robots": ["read_robot", "Robot", "Tree", "tree_system", "joint_dissipation"],
-        "Further records of a system": [
-            "ClosedForm", "RecursiveSystem", "InverseForward", "PhaseRates", "PlainDynamics", "PlainFlow",
-        ],
+        "Files": ["load_trajectories", "save_trajectories", "build", "describe"],
+        "Robots": ["read_robot", "tree_system", "joint_dissipation"],
+        "Further records of a system": ["InverseForward", "PhaseRates"],
     },
 }  # fmt: skip
 """The names of `dln_jax` itself, in the order in which a reader needs them."""

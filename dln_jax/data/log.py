@@ -57,6 +57,11 @@ class Log(NamedTuple):
     tip: Any = None
     """q -> position [2] of the last body, m, for figures; `None` if unknown."""
 
+    def __repr__(self) -> str:
+        """Name, size and plant in place of the arrays."""
+        size = f"{len(self.data.t)} samples of {len(np.unique(self.data.trajectory))} trajectories"
+        return f"Log of {self.name}: {size}\n  {'-'.join(self.needs.joints)} ({self.needs_origin})"
+
     @property
     def torque(self) -> str:
         """The torque, measured or filtered, that models are fitted to and uncertainty bands refer to."""

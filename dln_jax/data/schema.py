@@ -70,6 +70,12 @@ class Trajectories(NamedTuple):
         """d."""
         return self.q.shape[1]
 
+    def __repr__(self) -> str:
+        """Sizes and keys in place of the arrays."""
+        keys = [key for key in PER_JOINT if getattr(self, key) is not None]
+        size = f"{len(self.t)} samples of {len(np.unique(self.trajectory))} trajectories, d = {self.degrees_of_freedom}"
+        return f"Trajectories: {size}\n  {', '.join(keys)}; estimated: {', '.join(self.estimated) or 'none'}"
+
 
 def load(
     path: str | Path,

@@ -18,6 +18,7 @@ positive, and for scales that are neither one number nor one per coordinate.
 """
 
 import inspect
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -58,6 +59,13 @@ class Model(NamedTuple):
     """Random key -> parameters."""
     energies: Callable[[Parameters], Any]
     """Parameters -> a record of energies, one of `mechanics.equations.System`, as functions of one state."""
+
+    def __repr__(self) -> str:
+        """Name of the factory, number of parameters, and their shapes."""
+        leaves = jax.tree_util.tree_leaves_with_path(jax.eval_shape(self.init, jax.random.key(0)))
+        shapes = ", ".join(f"{jax.tree_util.keystr(path)} {list(leaf.shape)}" for path, leaf in leaves)
+        count = sum(math.prod(leaf.shape) for _, leaf in leaves)
+        return f"Model of {self.energies.__qualname__.partition('.')[0]}: {count:,} parameters\n  {shapes:.100}"
 
 
 @dataclass(frozen=True, eq=False)

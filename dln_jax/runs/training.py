@@ -4,23 +4,24 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
-
-import jax
+from typing import TYPE_CHECKING, Any
 
 from dln_jax.data.log import Log, log_of, read_log
 from dln_jax.data.parts import Parts, split_log
+from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, select_samples
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.learning.context import Context
 from dln_jax.learning.fit import Fit, with_uncertainty
 from dln_jax.learning.settings import WAYS
-from dln_jax.runs.evaluation import evaluate as evaluate_fit
-from dln_jax.runs.report import Report
+from dln_jax.precision import require_double_precision
 from dln_jax.time_limit import deadline
 from dln_jax.types import InputError
 from dln_jax.zoo.run import Run, load
+
+if TYPE_CHECKING:
+    from dln_jax.runs.report import Report
 
 
 def train(
@@ -54,8 +55,9 @@ def train(
     Raises:
         InputError: JAX without float64, an unknown model or setting, or data that the model cannot be fitted to.
     """
-    if not jax.config.values["jax_enable_x64"]:
-        raise InputError('train computes in float64; call jax.config.update("jax_enable_x64", True) before')
+    from dln_jax.runs.evaluation import evaluate as evaluate_fit  # draws, which the import of dln_jax need not
+
+    require_double_precision("train")
     if model not in WAYS:
         raise InputError(f"model is {model!r:.60}; expected one of {', '.join(WAYS)}")
     way = WAYS[model]
@@ -73,12 +75,51 @@ def train(
     return dataclasses.replace(fit, report=evaluate_fit(fit, parts, log, say=say))
 
 
-def evaluate(run: Run | str | Path, log: Log | Trajectories | str | Path) -> Report:
+def identify(
+    robot: Robot | str | Path,
+    log: Log | Trajectories | str | Path,
+    *,
+    test: str | None = None,
+    say: Callable[[str], None] = lambda line: None,
+) -> Fit:
+    """Identifies the bodies and the friction of a robot from a log, and evaluates them on held-out motions.
+
+        fit = dln_jax.identify("arm.urdf", dln_jax.read_log("mine.csv", robot="arm.urdf"))
+
+    The command `identify` also fits motions, coupled motors and temperature, and writes the robot's file.
+
+    Args:
+        robot: the robot, or its URDF or MJCF file.
+        log: from `read_log`; or trajectories, or a file, whose joints are matched by name.
+        test: test trajectories, as for `data.parts.split_log`.
+        say: takes lines on the progress.
+
+    Raises:
+        InputError: JAX without float64, or a log that does not belong to the robot.
+    """
+    from dln_jax.learning.fits.automatic import identified
+    from dln_jax.runs.evaluation import evaluate as evaluate_fit
+
+    require_double_precision("identify")
+    robot = robot if isinstance(robot, Robot) else read_robot(Path(robot))
+    if not isinstance(log, Log):
+        log = log_of(log, "the data", robot=robot) if isinstance(log, Trajectories) else read_log(log, robot=robot)
+    if log.needs.joints != robot.tree.joints:
+        raise InputError(f"{log.name} has other joints than the robot; read it by read_log(..., robot=...)")
+    log = log._replace(robot=log.robot or robot)
+    parts = split_log(log, test)
+    fit = with_uncertainty(identified(log, parts), parts, log.torque, say)
+    return dataclasses.replace(fit, report=evaluate_fit(fit, parts, log, say=say))
+
+
+def evaluate(run: Run | str | Path, log: Log | Trajectories | str | Path) -> "Report":
     """Evaluates a stored or fitted model on another log, all of which is the test.
 
     Raises:
         InputError: the model has no dynamics, or other joints than the log.
     """
+    from dln_jax.runs.evaluation import evaluate as evaluate_fit
+
     run = load(run) if isinstance(run, str | Path) else run
     needs, log = needs_from_json(run.description["needs"]), logged(log)
     if needs.joints != log.needs.joints:

@@ -5,6 +5,7 @@ A description has `name`, `precision` (f32 or f64), and every keyword in the sig
 importable factory, or "own" for a factory that must be passed when the model is loaded.
 """
 
+import contextlib
 import functools
 import importlib
 import inspect
@@ -107,10 +108,9 @@ def build(description: Description, *, factory: Callable[..., Any] | None = None
     if not isinstance(name, str):
         raise InputError(f"model description: name is {reprlib.repr(name)}, expected that of a model; {REMEDY}")
     if factory is None and name in CATALOGUE:
-        try:
-            return catalogued(json.dumps(description))
-        except (TypeError, ValueError):  # values that JSON does not have, which are refused below
-            pass
+        with contextlib.suppress(TypeError):  # values that JSON does not have, which are refused below
+            text = json.dumps(description)
+            return catalogued(text)
     return _built(description, functions_of(name, factory, trust=trust))
 
 
@@ -138,6 +138,28 @@ def _built(description: Description, functions: tuple[Callable[..., Any], ...]) 
         raise
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"model description: {error}; a release that is newer or older may have written it") from error
+
+
+def model_names() -> dict[str, str]:
+    """The models of the catalogue by name, each with the first line on its factory."""
+    return {name: (entry.factory.__doc__ or "").partition("\n")[0] for name, entry in CATALOGUE.items()}
+
+
+def make(name: str, needs: Needs, *, precision: str = "f64", **keywords: Any) -> Any:
+    """Makes a model of the catalogue for a plant; `print` shows its parameters.
+
+        model = make("structured-delan", Needs(joints=("revolute",)), width=16)
+
+    Args:
+        name: one of `model_names()`.
+        needs: joints and terms of the plant.
+        precision: f32 or f64.
+        keywords: keywords of the factory.
+
+    Raises:
+        InputError: as for `describe` and `build`.
+    """
+    return build(describe(name, precision=precision, needs=needs, **keywords))
 
 
 def functions_of(

@@ -53,6 +53,13 @@ class Run:
     value_function: "ValueRun | None" = None
     """Value function in the folder, if it has one."""
 
+    def __repr__(self) -> str:
+        """The model's name, its number of parameters, and whether it has an uncertainty."""
+        size = sum(np.size(leaf) for leaf in jax.tree.leaves(self.parameters))
+        more = "without uncertainty" if self.uncertainty is None else "with uncertainty"
+        name, precision = self.description["name"], self.description["precision"]
+        return f"{type(self).__name__} of {name}: {size:,} parameters, {precision}\n  {more}"
+
     @functools.cached_property
     def energies(self) -> Any:
         """One of `mechanics.equations.System`, not jitted. Raises InputError for a model without mechanics."""

@@ -5,9 +5,10 @@ import pytest
 from calls import assert_refused, command, json_of
 from motions import quick_motion
 
-from dln_jax import Flow, load
+from dln_jax import load
 from dln_jax.commands import train_hnn_task
 from dln_jax.data import schema
+from dln_jax.mechanics.dynamics import Flow
 from dln_jax.mechanics.equations import hamiltonian_of
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.training.hamiltonian import measurements, predictions, stages

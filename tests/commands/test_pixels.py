@@ -8,10 +8,11 @@ from calls import assert_refused, command, json_of
 from motions import quick_motion
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dln_jax import HamiltonianSystem, PlainFlow, flow, load
+from dln_jax import HamiltonianSystem, flow, load
 from dln_jax.commands import train_hnn_pixels
 from dln_jax.commands.pixels import fit, frames
 from dln_jax.commands.pixels.frames import FRAME_TIME, PIXELS, SIDE, energy, render, rod, swinging_rod
+from dln_jax.mechanics.dynamics import PlainFlow
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.models.latent_phase import LatentPhase, make_image_model

@@ -8,12 +8,13 @@ import pytest
 from calls import assert_refused, json_of, refused
 from planar_arm import ARM, FRICTION, motions
 
-from dln_jax import InputError, Robot, dynamics, joint_dissipation, load, tree_system
+from dln_jax import InputError, dynamics, joint_dissipation, load, tree_system
 from dln_jax.commands import train_delan
 from dln_jax.data import schema
 from dln_jax.data.log import read_log
 from dln_jax.data.parts import split_log
 from dln_jax.data.robot_files import mjcf
+from dln_jax.data.robots import Robot
 from dln_jax.learning.context import Context
 from dln_jax.learning.fits import automatic, tree
 from dln_jax.learning.settings import Automatic

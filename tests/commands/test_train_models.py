@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from calls import command, json_of
 
-from dln_jax import PlainDynamics, load
+from dln_jax import load
 from dln_jax.commands import train_delan, train_hnn
 from dln_jax.data import schema
 from dln_jax.learning.engine.optimisers import Adam, suited
 from dln_jax.learning.fits import network
+from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum
 

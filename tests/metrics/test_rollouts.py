@@ -7,8 +7,9 @@ import pytest
 from calls import one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dln_jax import LagrangianSystem, PlainDynamics, dynamics
+from dln_jax import LagrangianSystem, dynamics
 from dln_jax.data import schema
+from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.metrics.motions import (
     Motion,
     by_trajectory,

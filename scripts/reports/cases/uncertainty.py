@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax import GaussNewton, Model, Trajectories, fit, joint_dissipation, make_delan, tree_system
+from dln_jax import GaussNewton, Model, fit, joint_dissipation, make_delan, tree_system
 from dln_jax import load_trajectories as load
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders.smoothing import smooth
-from dln_jax.data.schema import from_arrays
+from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.data.splits import in_blocks, select, split, with_joints
 from dln_jax.learning import dynamics as problems
 from dln_jax.learning.linear import design, design_chunks, fit_linear

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax import Robot
 from dln_jax.commands import identify, train_delan
 from dln_jax.data.robot_files import mjcf
+from dln_jax.data.robots import Robot
 from dln_jax.errors import FitRefused
 from dln_jax.files import read_json
 from dln_jax.mechanics.trees.description import dh_frames, serial

@@ -18,15 +18,15 @@ import jax
 import numpy as np
 from numpy.typing import DTypeLike
 
-from dln_jax import Model, Robot, Trajectories, Tree, tree_system
+from dln_jax import Model, tree_system
 from dln_jax.data.robot_files import mjcf
-from dln_jax.data.robots import compiled_model
-from dln_jax.data.schema import from_arrays
+from dln_jax.data.robots import Robot, compiled_model
+from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees.description import serial
+from dln_jax.mechanics.trees.description import Tree, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.models.model import Parameters

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax import Trajectories, Tree, joint_dissipation, tree_system
+from dln_jax import joint_dissipation, tree_system
 from dln_jax.data.encoders.smoothing import smooth
-from dln_jax.data.schema import from_arrays
+from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.data.splits import every, select
 from dln_jax.identification.excitation.design import CRITERIA, Design, make_designer, random_designs
 from dln_jax.identification.excitation.limits import MotionLimits
@@ -27,7 +27,7 @@ from dln_jax.learning.friction import choose_terms, fit_friction, terms_of
 from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.weak_forms import fit_momentum
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees.description import dh_frames, serial
+from dln_jax.mechanics.trees.description import Tree, dh_frames, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.models.trees import make_rigid_tree
 from dln_jax.types import FrictionLaw

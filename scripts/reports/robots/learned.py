@@ -12,8 +12,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax import Adam, GaussNewton, Trajectories, Tree, fit, make_delan
+from dln_jax import Adam, GaussNewton, fit, make_delan
 from dln_jax.compilation import quick_compilation
+from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split
 from dln_jax.learning import dynamics, objectives
 from dln_jax.learning.kernel import fit_kernel
@@ -21,7 +22,7 @@ from dln_jax.learning.kinematics.fit import fit_tree
 from dln_jax.learning.kinematics.search import Search
 from dln_jax.learning.linear import fit_linear
 from dln_jax.mechanics import equations
-from dln_jax.mechanics.trees.description import make_tree
+from dln_jax.mechanics.trees.description import Tree, make_tree
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.mechanics.trees.recursions import newton_euler
 from dln_jax.models.kernel import make_trigonometric_kernel

@@ -13,13 +13,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from dln_jax import Robot
 from dln_jax.compilation import quick_compilation
 from dln_jax.data import schema
 from dln_jax.data.checks.channels import Finding
 from dln_jax.data.checks.report import quick
 from dln_jax.data.encoders.clock import source_clock
 from dln_jax.data.repeated_motions import motion_numbers
+from dln_jax.data.robots import Robot
 from dln_jax.mechanics.trees.description import make_tree
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.mechanics.trees.recursions import newton_euler

@@ -17,8 +17,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax import Trajectories, Tree
-from dln_jax.mechanics.trees.description import dh_frames, serial, with_payload
+from dln_jax.data.schema import Trajectories
+from dln_jax.mechanics.trees.description import Tree, dh_frames, serial, with_payload
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.mechanics.trees.recursions import newton_euler
 from dln_jax.precision import in_float64

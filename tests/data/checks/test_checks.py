@@ -7,13 +7,13 @@ import pytest
 from calls import one_line
 from motions import sums_of_sines
 
-from dln_jax import Robot
 from dln_jax.data.checks.channels import check_derivatives, flat_share
 from dln_jax.data.checks.priors import STRONGEST, WEAKEST, Explanation, covariances
 from dln_jax.data.checks.report import examine, quick, read, report
 from dln_jax.data.checks.torques import decisive
 from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.log import FILTERED, log_of
+from dln_jax.data.robots import Robot
 from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics.trees.description import dh_frames, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters
