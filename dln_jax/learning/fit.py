@@ -27,7 +27,7 @@ from dln_jax.zoo.run import Run, save
 from dln_jax.zoo.uncertainty_files import save_uncertainty
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fit(Run):
     """A fitted model of dynamics, with its functions and how it was fitted."""
 

@@ -61,11 +61,11 @@ class Model(NamedTuple):
     """Parameters -> a record of energies, one of `mechanics.equations.System`, as functions of one state."""
 
     def __repr__(self) -> str:
-        """Name of the factory, number of parameters, and their shapes."""
+        """Number of parameters, and their shapes."""
         leaves = jax.tree_util.tree_leaves_with_path(jax.eval_shape(self.init, jax.random.key(0)))
         shapes = ", ".join(f"{jax.tree_util.keystr(path)} {list(leaf.shape)}" for path, leaf in leaves)
         count = sum(math.prod(leaf.shape) for _, leaf in leaves)
-        return f"Model of {self.energies.__qualname__.partition('.')[0]}: {count:,} parameters\n  {shapes:.100}"
+        return f"Model of {count:,} parameters\n  {shapes:.100}"
 
 
 @dataclass(frozen=True, eq=False)
