@@ -149,7 +149,7 @@ def log_of(
         InputError: needs, joints of the data and of the robot that contradict each other, no torques although
             `driven`, a cut-off that the data cannot be filtered at, or a log with an error.
     """
-    if robot is not None:
+    if robot is not None and robot.tree.names:
         try:
             data = with_joints(data, robot.tree.names)
         except InputError as error:
@@ -178,7 +178,8 @@ def log_of(
             smoothed = smooth(data, None if cutoff in (None, "auto") else cutoff, decimate=decimate)
         except InputError as error:
             if cutoff is not None:  # otherwise the finding remains: the log is too short for a filter
-                raise InputError(f"--cutoff {cutoff}: {error}") from None
+                text = cutoff if isinstance(cutoff, str) else f"{cutoff:g}"
+                raise InputError(f"--cutoff {text}: {error}") from None
     ignored = {*settled, *(["friction"] if needs.friction or needs.joint_friction else [])}
     if smoothed is not None:
         # Splines through q keep its noise.

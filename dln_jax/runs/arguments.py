@@ -196,7 +196,7 @@ def pairs_of(option: str, words: Iterable[str]) -> dict[str, str]:
     for word in words:
         name, _, value = (part.strip() for part in word.partition("="))
         if not (name and value):
-            raise InputError(f"{option} has {word!r:.60}, which is no NAME=VALUE")
+            raise InputError(f"{option} has {word!r:.60}; expected NAME=VALUE")
         if name in values:
             raise InputError(f"{option} names '{name:.60}' twice; give it once")
         values[name] = value

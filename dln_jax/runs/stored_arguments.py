@@ -136,5 +136,6 @@ def command_folder(options: Any, command: str, **chosen: Any) -> Iterator[Path]:
     with folder_of_run as folder:
         if resume:
             wait_for_all(options)
-        write_config(folder, options, **chosen)
+        else:
+            write_config(folder, options, **chosen)
         yield folder

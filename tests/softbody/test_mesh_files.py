@@ -301,7 +301,7 @@ def test_mistakes_with_mesh_files_are_one_line(tmp_path, capsys, monkeypatch):
     finger.write_bytes(gmsh_file(BODIES[2], "4.1", False))
     rows = [
         ("--mesh", finger, "--pin", ",", "--pin names no set"),
-        ("--mesh", finger, "--youngs-modulus-of", "tip", "expected SET=PA"),
+        ("--mesh", finger, "--youngs-modulus-of", "tip", "expected NAME=VALUE"),
         ("--mesh", tmp_path / "absent.msh", "absent.msh: no such file"),
         ("--scene", "drop", "--mesh", finger, "--pin", "base", "the drop scene has no --pin"),
         ("--pin", "base", "--pin is an option of --mesh"),

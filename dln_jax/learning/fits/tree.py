@@ -32,9 +32,6 @@ def fit(settings: LearnedTree, log: Log, parts: Parts, context: Context) -> Fit:
         parents=parents,
         velocity_scale=needs.velocity_scale,
     )
-    near = {}
-    if prior is not None:
-        near = {"kinematic_prior": prior.frames, "prior_angle": prior.angle, "prior_length": prior.length}
     solution = fit_tree(
         needs,
         parts.sets.train,
@@ -42,7 +39,7 @@ def fit(settings: LearnedTree, log: Log, parts: Parts, context: Context) -> Fit:
         parents=description["parents"],
         acceleration=description["acceleration"],
         velocity_scale=description["velocity_scale"],
-        settings=Search(seed=context.seed, seconds=context.seconds, **near),
+        settings=Search(seed=context.seed, seconds=context.seconds, kinematic_prior=prior),
         report=context.say,
     )
     size = f"{solution.parameter_count} parameters, of the linear ones rank {solution.rank}, "
