@@ -57,7 +57,7 @@ def test_a_job_that_is_queued_again_is_the_same_job(tmp_path):
 def test_options_of_sbatch_are_checked(cluster, tmp_path, capsys):
     rows = [
         ("--slurm partion=gpu", "partion"),
-        ("--slurm time", "no NAME=VALUE"),
+        ("--slurm time", "expected NAME=VALUE"),
         ("--slurm", "time=5 time=6", "names 'time' twice"),
         ("--slurm time=1-00:00", "whole minutes"),
         # Larger than Slurm's arrays.

@@ -21,8 +21,8 @@ def test_grid_of_a_text():
 
 MISTAKES = {
     "": "names no option",
-    "width": "no NAME=VALUE",
-    "width=": "no NAME=VALUE",
+    "width": "expected NAME=VALUE",
+    "width=": "expected NAME=VALUE",
     "width=8,,16": "empty value",
     "width='8": "close the quotes",
     "seed=3:3": "empty range",
