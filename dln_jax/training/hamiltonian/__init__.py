@@ -1,1 +1,1 @@
-"""Hamiltonian training on a user's motions and the published tasks: measurements, model selection and fits."""
+"""Hamiltonian training on images."""

@@ -1,0 +1,213 @@
+"""Evaluates a Hamiltonian model on the motions of its task: errors, times, verdict, table and figures."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+from dln_jax.commands.phase_spaces.data import PhaseLog
+from dln_jax.commands.phase_spaces.training import MOTIONS, RATES, PhaseFit, in_velocities
+from dln_jax.data.arrays import spread
+from dln_jax.data.schema import column
+from dln_jax.figures.animations import write_motion_gif
+from dln_jax.figures.phase_space import Field, motion_figure
+from dln_jax.figures.style import TRUTH
+from dln_jax.figures.training import training_curve
+from dln_jax.learning.latency import one_step
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.metrics.measured_predictions import on_grid, padded, predict_measured, prediction_metrics
+from dln_jax.metrics.phase_space import (
+    Motions,
+    energies,
+    field_errors,
+    field_rates,
+    motion_errors,
+    predict,
+    quarter_period,
+)
+from dln_jax.metrics.verdict import judge_motions
+from dln_jax.models.model import Model, Parameters
+from dln_jax.runs.report import Report, png
+from dln_jax.zoo.descriptions import build
+from dln_jax.zoo.run import Run
+
+SUBSTEPS = 4
+"""RK4 substeps between two samples of a measured motion."""
+GIF_FRAMES = 80
+LOSSES = {
+    RATES: "rates: mean square error of (qd, pd)",
+    MOTIONS: "motions: mean square error of (q, p) over its weight",
+}
+"""Label of the loss of every stage."""
+RATE_UNITS = "units of qd² and pd²"
+OVER_STARTS = {"": "", "_standard_error": ": its standard error over starts", "_median": ": its median over starts"}
+METRICS = {
+    **{
+        f"{name}{ending}": (f"{label}, mean square error{words}", unit)
+        for name, label, unit in (
+            ("energy_mse", "energy along predicted motions", "J²"),
+            ("published_energy_mse", "published energy along predicted motions", "units of that energy²"),
+            ("rollout_mse", "(q, p) of predicted motions", "units of q² and p²"),
+        )
+        for ending, words in OVER_STARTS.items()
+    },
+    "vpt_seconds": ("time of correct prediction of motions", "s"),
+    "vpt_median_seconds": ("time of correct prediction of motions: its median", "s"),
+    "predicted_seconds": ("duration of the predicted motions", "s"),
+    "vpt_lyapunov": ("time of correct prediction of motions, in Lyapunov times of the model", "1"),
+    "lyapunov_seconds": ("Lyapunov time of the model", "s"),
+    "energy_drift": ("energy error along predicted motions, over the largest kinetic energy", "1"),
+    "train_loss": ("(qd, pd) at training states, mean square error", RATE_UNITS),
+    "test_loss": ("(qd, pd) at test states, mean square error", RATE_UNITS),
+    "clean_field_mse": ("(qd, pd) against the exact field, mean square error", RATE_UNITS),
+    "train_seconds": ("train seconds", "s"),
+    "compile_seconds": ("compile seconds", "s"),
+    "one_step_p50_us": ("one step p50 us", "µs"),
+    "one_step_p99_us": ("one step p99 us", "µs"),
+    "validation_error": ("validation loss of the last stage", "see training.png"),
+}
+"""Label and unit of a metric by its name; other names explain themselves. The true plant has an energy error of 0."""
+UNITS = {"revolute": ("rad", "kg m²/s"), "prismatic": ("m", "kg m/s")}
+"""Units of q and p."""
+
+
+def evaluate(log: PhaseLog, fit: PhaseFit) -> Report:
+    """Evaluates a fit on the test of its task."""
+    truth, name, predicted = log.truth[0], fit.description["name"], predicted_motions(log, fit)
+    run = Run(build(fit.description), fit.training.parameters, fit.description)
+    in_qd = in_velocities(log, fit.description)
+    rates = partial(accelerations if in_qd else field_rates, run.model, run.parameters)
+    verdict = judge_motions(
+        predicted,
+        log.truth,
+        **units_of_verdict(log),
+        fitted=samples_fitted(log, fit),
+        rates=rates_unexplained(log, rates, in_qd),
+    )
+    latency = one_step(run.flow.rates, list(zip(truth.q[0, :256], truth.p[0, :256], strict=True)), calls=2000)
+    metrics = {
+        **errors(log, fit, predicted),
+        "one_step_p50_us": latency.p50_us,
+        "one_step_p99_us": latency.p99_us,
+    }
+    if log.noise is not None:
+        metrics |= {f"q{joint}_noise": float(sd) for joint, sd in enumerate(np.ravel(log.noise.q), start=1)}
+    metrics["validation_error"] = float(fit.training.validation)
+    metrics = {key: value for key, value in metrics.items() if np.isfinite(value)}
+    rows = []
+    for key, value in metrics.items():
+        label, unit = METRICS.get(key, (key.replace("_", " "), ""))
+        rows.append((label, f"{value:.4g}", unit))
+
+    of_q, of_p = UNITS[log.needs.joints[0]]
+    motions, H = {TRUTH: truth, name: predicted[0]}, log.energy
+    heights = {key: moved.q[:, :, 0] if H is None else energies(H, moved) for key, moved in motions.items()}
+    quantity, units = ("q1", (of_q, f"{of_q}/s", of_q)) if H is None else ("true energy", (of_q, of_p, "J"))
+    stride = max(1, len(truth.t) // GIF_FRAMES)
+    figures = {
+        "motions.png": png(motion_figure, motions, heights, fields={name: rates}, quantity=quantity, units=units),
+        "motions.gif": lambda path: write_motion_gif(path, motions, stride=stride, units=units[:2]),
+    }
+    if len(fit.history) > 1:
+        best = fit.history[-1].step - fit.training.history[-1].step + fit.training.best_step
+        named = [at._replace(stage=LOSSES[at.stage]) for at in fit.history]
+        words = {"error": "loss", "loss": "training loss", "unit": "loss, of each stage in its own units"}
+        figures["training.png"] = png(training_curve, named, best_step=best, **words)
+    failed = fit.stop == "not finite"
+    return Report(
+        metrics=metrics | {"verdict": verdict.number},
+        rows=rows,
+        title=f"test motions of {log.name}, f64",
+        verdict=verdict,
+        figures=figures,
+        chosen=fit.description,
+        lines=(fit.remark,) if fit.remark and not failed else (),
+        error=fit.remark if failed else "",
+    )
+
+
+def errors(log: PhaseLog, fit: PhaseFit, predicted: list[Motions]) -> dict[str, float]:
+    """Errors of the predicted motions and of the field, prediction times, and costs."""
+    model, parameters = build(fit.description), fit.training.parameters
+    numbers = motion_errors(predicted, log.truth, log.energy, published_energy=log.published_energy)
+    if log.tests is not None:
+        fitted = log.task.window
+        known = {"fitted": fitted, "substeps": SUBSTEPS, "momenta": not in_velocities(log, fit.description)}
+        moved, variance = predict_measured(model, parameters, log.tests, **known), log.fitted.q.var(axis=0)
+        numbers |= prediction_metrics(log.tests, moved, fitted=fitted, variance=np.where(variance > 0, variance, 1.0))
+    if log.exact is not None:
+        trained, tested = (field_errors(model, parameters, part) for part in log.exact)
+        numbers["train_loss"], numbers["test_loss"] = trained["loss"], tested["loss"]
+        numbers["clean_field_mse"] = tested["clean_field_mse"]
+    numbers["train_seconds"] = fit.history[-1].seconds if fit.history else 0.0
+    numbers["compile_seconds"] = fit.compile_seconds
+    numbers["parameters"] = float(sum(leaf.size for leaf in jax.tree.leaves(parameters)))
+    return numbers
+
+
+def predicted_motions(log: PhaseLog, fit: PhaseFit) -> list[Motions]:
+    """Predicts the task's motions from their first states; p is the velocity for models with their own momenta."""
+    model, parameters = build(fit.description), fit.training.parameters
+    if in_velocities(log, fit.description):
+        windows = padded([on_grid(true.t, true.q[0], true.p[0]) for true in log.truth])
+        moved = predict_measured(model, parameters, windows, fitted=samples_fitted(log, fit), substeps=SUBSTEPS)
+        kept = [np.flatnonzero(weight) for weight in windows.weight]
+        pairs = zip(log.truth, moved.q, moved.qd, kept, strict=True)
+        return [Motions(true.t, q[None, rows], qd[None, rows]) for true, q, qd, rows in pairs]
+    # All times are padded to one length, so that one program predicts all motions.
+    longest = max(len(true.t) for true in log.truth)
+    found = []
+    for true in log.truth:
+        count = len(true.t)
+        t = np.pad(true.t, (0, longest - count), mode="edge")
+        moved = predict(model, parameters, true.q[:, 0], true.p[:, 0], t)
+        found.append(Motions(moved.t[:count], moved.q[:, :count], moved.p[:, :count]))
+    return found
+
+
+def samples_fitted(log: PhaseLog, fit: PhaseFit) -> int:
+    """Number of samples that the start of a predicted motion is fitted to; 1 if it is the first state.
+
+    It is a window or, where samples are dense, an eighth of the period, but at most half of the shortest motion.
+    """
+    if not in_velocities(log, fit.description):
+        return 1
+    angles = np.array([joint == "revolute" for joint in log.needs.joints])
+    dense = min(quarter_period(true.q, ~angles) for true in log.truth) // 2
+    return max(2, min(max(log.task.window, dense), *(len(true.t) // 2 for true in log.truth)))
+
+
+def accelerations(model: Model, parameters: Parameters, q: np.ndarray, qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(qd, qdd) of states, without torques."""
+    accelerate = dynamics(model.energies(parameters)).forward_dynamics
+    qdd = jax.jit(jax.vmap(lambda q, qd: accelerate(q, qd, 0 * q)))(q, qd)
+    return np.asarray(qd), np.asarray(qdd)
+
+
+def units_of_verdict(log: PhaseLog) -> dict[str, Any]:
+    """Spread of q and p, which of them are bounded and were measured, and their noise if known."""
+    data, d = log.fitted, log.needs.degrees_of_freedom
+    size = np.concatenate([spread("q", data.q), spread("p", column(data, "p"))])
+    angles = [joint == "revolute" for joint in log.needs.joints]
+    return {
+        "size": np.where(size > 0, size, 1.0),
+        "bounded": ~np.array(angles + [False] * d),
+        "noise": log.state_noise,
+        "measured": np.repeat([True, "p" not in data.estimated], d),
+    }
+
+
+def rates_unexplained(log: PhaseLog, rates: Field, in_qd: bool) -> np.ndarray:
+    """Shares of the variance of measured rates that the model leaves unexplained at test states.
+
+    The noise of estimated rates is unknown, and velocities are states of models in velocities: these do not count.
+    """
+    data = log.held_out
+    informative = ["qd" not in data.estimated and not in_qd, "pd" not in data.estimated]
+    known = np.repeat(informative, log.needs.degrees_of_freedom)
+    if not known.any():
+        return np.zeros(1)
+    sides = rates(data.q, column(data, "p")), (data.qd, column(data, "pd"))
+    model, true = (np.concatenate(side, axis=1)[:, known] for side in sides)
+    return np.mean((model - true) ** 2, axis=0) / np.var(true, axis=0)
