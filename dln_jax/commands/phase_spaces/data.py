@@ -305,6 +305,12 @@ def fitted_and_test(
     return fitted, held, ()
 
 
+def spreads(data: Trajectories, *keys: str) -> np.ndarray:
+    """Standard deviations of columns, 1 for those that do not vary."""
+    size = np.concatenate([spread(key, column(data, key)) for key in keys])
+    return np.where(size > 0, size, 1.0)
+
+
 def with_rates(data: Trajectories, noise: tuple[float, ...] | None) -> tuple[Trajectories, Noise]:
     """Adds velocities and accelerations from local polynomials if they were not measured, and estimates the noise.
 
@@ -312,14 +318,13 @@ def with_rates(data: Trajectories, noise: tuple[float, ...] | None) -> tuple[Tra
         InputError: segments that are too short.
     """
 
-    def limited(noise: Any, values: np.ndarray) -> tuple[float, ...]:
-        size = spread("q and qd", values)
-        return tuple(np.maximum(noise, LEAST_NOISE * np.where(size > 0, size, 1.0)).tolist())
+    def limited(noise: Any, key: str) -> tuple[float, ...]:
+        return tuple(np.maximum(noise, LEAST_NOISE * spreads(data, key)).tolist())
 
     smooth = smooth_locally(data)
-    of_q = limited(smooth.noise if noise is None else noise, data.q)
+    of_q = limited(smooth.noise if noise is None else noise, "q")
     if "qd" not in data.estimated:
-        return data, Noise(of_q, limited(smooth_locally(data._replace(q=data.qd)).noise, data.qd))
+        return data, Noise(of_q, limited(smooth_locally(data._replace(q=data.qd)).noise, "qd"))
     kept = select_samples(data, smooth.rows)
     return kept._replace(qd=smooth.data.qd, qdd=smooth.data.qdd), Noise(of_q)
 
@@ -350,8 +355,7 @@ def weights_of(data: Trajectories, noise: tuple[float, ...] | None) -> dict[str,
     count = int(np.searchsorted(np.cumsum([len(parts[index]) for index in order]), SURVEYED)) + 1
     surveyed = select_samples(data, np.concatenate([parts[index] for index in sorted(order[:count])]))
     keys = ("q", "p", "qd", "pd")
-    size = np.concatenate([spread(key, column(data, key)) for key in keys])
-    size = np.where(size > 0, size, 1.0)
+    size = spreads(data, *keys)
     found = [smooth_locally(surveyed._replace(q=column(surveyed, key))) for key in keys]
     deviation = np.concatenate([smooth.noise for smooth in found])
     resolved = np.concatenate([smooth.resolved for smooth in found])

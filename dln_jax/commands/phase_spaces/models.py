@@ -94,7 +94,7 @@ def polynomial_degree(log: PhaseLog) -> int:
     fitted, validation = hold_out(log.fitted, VALIDATION_SHARE, 0)
 
     def attempt(degree: int) -> tuple[Any, np.ndarray]:
-        description = describe_for(POLYNOMIAL, fitted, log.needs, precision="f64", degree=degree)
+        description = description_of(log, POLYNOMIAL, degree=degree)
         return match_linear(build(description), fitted, validation=validation)
 
     return select(DEGREES, attempt, patience=PATIENCE)[0].candidate

@@ -6,16 +6,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from dln_jax.commands.phase_spaces.data import PhaseLog
-from dln_jax.commands.phase_spaces.training import MOTIONS, RATES, PhaseFit, in_velocities
-from dln_jax.data.arrays import spread
+from dln_jax.commands.phase_spaces.data import PhaseLog, spreads
+from dln_jax.commands.phase_spaces.training import MOTIONS, RATES, PhaseFit
 from dln_jax.data.schema import column
 from dln_jax.figures.animations import write_motion_gif
 from dln_jax.figures.phase_space import Field, motion_figure
 from dln_jax.figures.style import TRUTH
 from dln_jax.figures.training import training_curve
 from dln_jax.learning.latency import one_step
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.measured_predictions import on_grid, padded, predict_measured, prediction_metrics
 from dln_jax.metrics.phase_space import (
     Motions,
@@ -27,9 +25,7 @@ from dln_jax.metrics.phase_space import (
     quarter_period,
 )
 from dln_jax.metrics.verdict import judge_motions
-from dln_jax.models.model import Model, Parameters
 from dln_jax.runs.report import Report, png
-from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import Run
 
 SUBSTEPS = 4
@@ -74,16 +70,14 @@ UNITS = {"revolute": ("rad", "kg m²/s"), "prismatic": ("m", "kg m/s")}
 
 def evaluate(log: PhaseLog, fit: PhaseFit) -> Report:
     """Evaluates a fit on the test of its task."""
-    truth, name, predicted = log.truth[0], fit.description["name"], predicted_motions(log, fit)
-    run = Run(build(fit.description), fit.training.parameters, fit.description)
-    in_qd = in_velocities(log, fit.description)
-    rates = partial(accelerations if in_qd else field_rates, run.model, run.parameters)
+    truth, run, predicted = log.truth[0], fit.run, predicted_motions(log, fit)
+    rates = partial(accelerations, run) if fit.velocities else partial(field_rates, run.model, run.parameters)
     verdict = judge_motions(
         predicted,
         log.truth,
         **units_of_verdict(log),
         fitted=samples_fitted(log, fit),
-        rates=rates_unexplained(log, rates, in_qd),
+        rates=rates_unexplained(log, rates, fit.velocities),
     )
     latency = one_step(run.flow.rates, list(zip(truth.q[0, :256], truth.p[0, :256], strict=True)), calls=2000)
     metrics = {
@@ -101,7 +95,8 @@ def evaluate(log: PhaseLog, fit: PhaseFit) -> Report:
         rows.append((label, f"{value:.4g}", unit))
 
     of_q, of_p = UNITS[log.needs.joints[0]]
-    motions, H = {TRUTH: truth, name: predicted[0]}, log.energy
+    name, H = run.description["name"], log.energy
+    motions = {TRUTH: truth, name: predicted[0]}
     heights = {key: moved.q[:, :, 0] if H is None else energies(H, moved) for key, moved in motions.items()}
     quantity, units = ("q1", (of_q, f"{of_q}/s", of_q)) if H is None else ("true energy", (of_q, of_p, "J"))
     stride = max(1, len(truth.t) // GIF_FRAMES)
@@ -121,7 +116,7 @@ def evaluate(log: PhaseLog, fit: PhaseFit) -> Report:
         title=f"test motions of {log.name}, f64",
         verdict=verdict,
         figures=figures,
-        chosen=fit.description,
+        chosen=run.description,
         lines=(fit.remark,) if fit.remark and not failed else (),
         error=fit.remark if failed else "",
     )
@@ -129,11 +124,11 @@ def evaluate(log: PhaseLog, fit: PhaseFit) -> Report:
 
 def errors(log: PhaseLog, fit: PhaseFit, predicted: list[Motions]) -> dict[str, float]:
     """Errors of the predicted motions and of the field, prediction times, and costs."""
-    model, parameters = build(fit.description), fit.training.parameters
+    model, parameters = fit.run.model, fit.run.parameters
     numbers = motion_errors(predicted, log.truth, log.energy, published_energy=log.published_energy)
     if log.tests is not None:
         fitted = log.task.window
-        known = {"fitted": fitted, "substeps": SUBSTEPS, "momenta": not in_velocities(log, fit.description)}
+        known = {"fitted": fitted, "substeps": SUBSTEPS, "momenta": not fit.velocities}
         moved, variance = predict_measured(model, parameters, log.tests, **known), log.fitted.q.var(axis=0)
         numbers |= prediction_metrics(log.tests, moved, fitted=fitted, variance=np.where(variance > 0, variance, 1.0))
     if log.exact is not None:
@@ -148,8 +143,8 @@ def errors(log: PhaseLog, fit: PhaseFit, predicted: list[Motions]) -> dict[str, 
 
 def predicted_motions(log: PhaseLog, fit: PhaseFit) -> list[Motions]:
     """Predicts the task's motions from their first states; p is the velocity for models with their own momenta."""
-    model, parameters = build(fit.description), fit.training.parameters
-    if in_velocities(log, fit.description):
+    model, parameters = fit.run.model, fit.run.parameters
+    if fit.velocities:
         windows = padded([on_grid(true.t, true.q[0], true.p[0]) for true in log.truth])
         moved = predict_measured(model, parameters, windows, fitted=samples_fitted(log, fit), substeps=SUBSTEPS)
         kept = [np.flatnonzero(weight) for weight in windows.weight]
@@ -171,27 +166,24 @@ def samples_fitted(log: PhaseLog, fit: PhaseFit) -> int:
 
     It is a window or, where samples are dense, an eighth of the period, but at most half of the shortest motion.
     """
-    if not in_velocities(log, fit.description):
+    if not fit.velocities:
         return 1
     angles = np.array([joint == "revolute" for joint in log.needs.joints])
     dense = min(quarter_period(true.q, ~angles) for true in log.truth) // 2
     return max(2, min(max(log.task.window, dense), *(len(true.t) // 2 for true in log.truth)))
 
 
-def accelerations(model: Model, parameters: Parameters, q: np.ndarray, qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def accelerations(run: Run, q: np.ndarray, qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(qd, qdd) of states, without torques."""
-    accelerate = dynamics(model.energies(parameters)).forward_dynamics
-    qdd = jax.jit(jax.vmap(lambda q, qd: accelerate(q, qd, 0 * q)))(q, qd)
-    return np.asarray(qd), np.asarray(qdd)
+    return np.asarray(qd), np.asarray(jax.vmap(run.dynamics.forward_dynamics)(q, qd, 0 * q))
 
 
 def units_of_verdict(log: PhaseLog) -> dict[str, Any]:
     """Spread of q and p, which of them are bounded and were measured, and their noise if known."""
     data, d = log.fitted, log.needs.degrees_of_freedom
-    size = np.concatenate([spread("q", data.q), spread("p", column(data, "p"))])
     angles = [joint == "revolute" for joint in log.needs.joints]
     return {
-        "size": np.where(size > 0, size, 1.0),
+        "size": spreads(data, "q", "p"),
         "bounded": ~np.array(angles + [False] * d),
         "noise": log.state_noise,
         "measured": np.repeat([True, "p" not in data.estimated], d),
@@ -209,5 +201,5 @@ def rates_unexplained(log: PhaseLog, rates: Field, in_qd: bool) -> np.ndarray:
     if not known.any():
         return np.zeros(1)
     sides = rates(data.q, column(data, "p")), (data.qd, column(data, "pd"))
-    model, true = (np.concatenate(side, axis=1)[:, known] for side in sides)
+    model, true = (np.hstack(side)[:, known] for side in sides)
     return np.mean((model - true) ** 2, axis=0) / np.var(true, axis=0)

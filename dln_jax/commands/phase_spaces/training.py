@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from dln_jax.commands.phase_spaces.data import ANCHOR, PhaseLog
-from dln_jax.data.arrays import spread
+from dln_jax.commands.phase_spaces.data import ANCHOR, PhaseLog, spreads
 from dln_jax.data.schema import Trajectories, column
 from dln_jax.data.splits import PER_SAMPLE, hold_out
 from dln_jax.learning import accelerations, measured_motions, motions, rates
@@ -26,7 +25,7 @@ from dln_jax.learning.rates import match_linear
 from dln_jax.scale.mesh import of_first_process
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import Description, build
-from dln_jax.zoo.run import save
+from dln_jax.zoo.run import Run, save
 
 POLYNOMIAL = "polynomial-hamiltonian"
 """Model whose fit of rates is one least-squares problem."""
@@ -56,9 +55,12 @@ Halves = tuple[Trajectories, Trajectories]
 class PhaseFit(NamedTuple):
     """A trained model."""
 
-    description: Description
+    run: Run
+    """The model with its parameters and functions."""
+    velocities: bool
+    """Whether the model was fitted in coordinates and velocities."""
     training: Training
-    """The last fit, whose parameters are the result."""
+    """The last fit."""
     history: list[Progress]
     """Progress of all fits, with a continuous count of steps and seconds."""
     compile_seconds: float
@@ -126,11 +128,10 @@ def substeps_of(windows: Windows, weights: Weights) -> int:
 
 def deviations(data: Trajectories) -> Weights:
     """Weights by the spread of the data; velocities from finite differences of q only anchor the scale of p."""
-    p = column(data, "p")
-    of_q, of_p = (np.where(size > 0, size, 1.0) for size in (spread("q", data.q), spread("p", p)))
-    if "qd" in data.estimated and np.array_equal(p, data.qd):
-        of_p = ANCHOR * of_p
-    return Weights(state=tuple(np.concatenate([of_q, of_p]).tolist()))
+    size = spreads(data, "q", "p")
+    if "qd" in data.estimated and np.array_equal(column(data, "p"), data.qd):
+        size[data.degrees_of_freedom :] *= ANCHOR
+    return Weights(state=tuple(size.tolist()))
 
 
 def train(
@@ -208,7 +209,8 @@ def train(
         raise InputError(remark or "no validation error is finite; look for very large numbers in the data")
     history = one_after_the_other([at._replace(stage=name) for at in one.history] for name, one in done.items())
     compiled = sum(one.compile_seconds for one in done.values())
-    return PhaseFit(description, training, history, compiled, stop, remark)
+    run = Run(build(description), training.parameters, description)
+    return PhaseFit(run, in_velocities(log, description), training, history, compiled, stop, remark)
 
 
 def rates_are_exact(log: PhaseLog, description: Description, validation: Trajectories, first: Training) -> bool:

@@ -24,7 +24,6 @@ from dln_jax.models.latent_phase import Field
 from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.training.hamiltonian import pixels
 from dln_jax.types import InputError, require_positive
-from dln_jax.zoo.descriptions import build
 from scripts.reports.run import Case, Numbers
 
 TINY = {"seeds": 1, "steps": 5, "trajectories": 10}
@@ -143,14 +142,14 @@ def own_files(
 
 def energy_error(named: PhaseLog, fit: PhaseFit) -> float:
     """Mean square error of the task's energy along motions from its test starts."""
-    description, d = fit.description, named.needs.degrees_of_freedom
+    run, d = fit.run, named.needs.degrees_of_freedom
     order = np.arange(d)
-    if description.get("order") == "axes":  # the task's own coordinates go body by body
-        order = order.reshape(-1, description["dimension"]).T.ravel()
-    model, back = build(description), np.argsort(order)
+    if run.description.get("order") == "axes":  # the task's own coordinates go body by body
+        order = order.reshape(-1, run.description["dimension"]).T.ravel()
+    back = np.argsort(order)
     predicted = []
     for true in named.truth:
-        moved = predict(model, fit.training.parameters, true.q[:, 0, order], true.p[:, 0, order], true.t)
+        moved = predict(run.model, run.parameters, true.q[:, 0, order], true.p[:, 0, order], true.t)
         predicted.append(Motions(moved.t, moved.q[..., back], moved.p[..., back]))
     return motion_errors(predicted, named.truth, named.energy)["energy_mse"]
 
