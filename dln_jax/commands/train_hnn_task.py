@@ -228,7 +228,7 @@ def main(options: Options) -> None:
         for line in lines_on(log, description):
             print(line)
         fit = train(log, description, context, optimiser=optimiser, steps=options.steps)
-        save(folder, description, fit.run.parameters)
+        save(folder, description, fit.parameters)
         if options.seconds is not None:
             print(f"{folder} holds the model; its evaluation follows and is not limited by --seconds")
         report = evaluate(log, fit)

@@ -12,7 +12,6 @@ from dln_jax import Needs, load
 from dln_jax.commands import train_hnn, train_hnn_task
 from dln_jax.commands.phase_spaces.data import MEASURED, TASKS, recorded
 from dln_jax.commands.phase_spaces.models import description_of
-from dln_jax.commands.phase_spaces.results import units_of_verdict
 
 TASK = "--task measured --no-figures --data"
 SLIDING = Needs(joints=("prismatic",))
@@ -35,7 +34,7 @@ def test_noise_of_states_and_rates_weighs_motions(files):
     weights, named = log.weights, TASKS["spring"].weights
     assert not log.free_of_noise and named.rate == 0.01
     assert_allclose(weights.state, 0.1, rtol=0.15)
-    assert_allclose(units_of_verdict(log)["noise"], 0.1, rtol=0.15)
+    assert_allclose(log.state_noise, 0.1, rtol=0.15)
     assert np.all(np.abs(np.log2(np.divide(weights.rate, named.rate))) < 1)
 
 
@@ -45,8 +44,7 @@ def test_noise_that_nobody_measured_is_none(files):
     q = np.cos(4 * t + np.arange(6)[:, None]).reshape(-1, 1)
     np.savez("coarse.npz", t=np.tile(t, 6), q=q, trajectory=np.repeat(np.arange(6), len(t)))
     log = own("coarse")
-    known = units_of_verdict(log)
-    assert not log.state_noise.any() and known["measured"].tolist() == [True, False] and not np.any(known["noise"])
+    assert not log.state_noise.any() and "p" in log.fitted.estimated
 
 
 def test_stated_noise_is_used_or_refused(files, capsys):

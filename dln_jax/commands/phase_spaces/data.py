@@ -332,8 +332,9 @@ def with_rates(data: Trajectories, noise: tuple[float, ...] | None) -> tuple[Tra
 def with_momenta(data: Trajectories) -> Trajectories:
     """Adds p, by default qd, and pd, by default the rate of p; `estimated` names those that are not measured."""
     if data.p is None:
-        own = tuple(key for key, source in (("p", "qd"), ("pd", "qdd")) if source in data.estimated)
-        return data._replace(p=data.qd, pd=data.qdd, estimated=(*data.estimated, *own))
+        own = {"qd": "p", "qdd": "pd"}
+        estimated = [own[key] for key in data.estimated if key in own]
+        return data._replace(p=data.qd, pd=data.qdd, estimated=(*data.estimated, *estimated))
     if data.pd is None:
         pd = time_derivative(data.t, data.p, data.trajectory, name="pd")
         return data._replace(pd=pd, estimated=(*data.estimated, "pd"))

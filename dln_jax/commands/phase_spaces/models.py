@@ -85,19 +85,14 @@ def description_of(log: PhaseLog, model: str, *, order: Order | None = None, **s
         values |= bodies._asdict()
     values |= {key: value for key, value in stated.items() if value is not None}
     if name == POLYNOMIAL and "degree" not in values:
-        values["degree"] = polynomial_degree(log)
+        fitted, validation = hold_out(log.fitted, VALIDATION_SHARE, 0)
+
+        def attempt(degree: int) -> tuple[Any, np.ndarray]:
+            model = build(description_of(log, POLYNOMIAL, degree=degree))
+            return match_linear(model, fitted, validation=validation)
+
+        values["degree"] = select(DEGREES, attempt, patience=PATIENCE)[0].candidate
     return describe_for(name, log.fitted, needs, precision="f64", pooled=True, **values)
-
-
-def polynomial_degree(log: PhaseLog) -> int:
-    """The smallest sufficient degree, chosen by validation trajectories."""
-    fitted, validation = hold_out(log.fitted, VALIDATION_SHARE, 0)
-
-    def attempt(degree: int) -> tuple[Any, np.ndarray]:
-        description = description_of(log, POLYNOMIAL, degree=degree)
-        return match_linear(build(description), fitted, validation=validation)
-
-    return select(DEGREES, attempt, patience=PATIENCE)[0].candidate
 
 
 def choose_model(

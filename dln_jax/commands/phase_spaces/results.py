@@ -1,7 +1,8 @@
 """Evaluates a Hamiltonian model on the motions of its task: errors, times, verdict, table and figures."""
 
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -70,14 +71,26 @@ UNITS = {"revolute": ("rad", "kg m²/s"), "prismatic": ("m", "kg m/s")}
 
 def evaluate(log: PhaseLog, fit: PhaseFit) -> Report:
     """Evaluates a fit on the test of its task."""
-    truth, run, predicted = log.truth[0], fit.run, predicted_motions(log, fit)
-    rates = partial(accelerations, run) if fit.velocities else partial(field_rates, run.model, run.parameters)
+    truth, predicted = log.truth[0], predicted_motions(log, fit)
+    run = Run(fit.model, fit.parameters, fit.description)
+    rates = partial(accelerations, run) if fit.velocities else partial(field_rates, fit.model, fit.parameters)
+    data, test, d = log.fitted, log.held_out, log.needs.degrees_of_freedom
+    # The noise of estimated rates is unknown, and velocities are states of models in velocities: these do not count.
+    known = np.repeat(["qd" not in test.estimated and not fit.velocities, "pd" not in test.estimated], d)
+    unexplained = np.zeros(1)
+    if known.any():
+        sides = rates(test.q, column(test, "p")), (test.qd, column(test, "pd"))
+        model, true = (np.hstack(side)[:, known] for side in sides)
+        unexplained = np.mean((model - true) ** 2, axis=0) / np.var(true, axis=0)
     verdict = judge_motions(
         predicted,
         log.truth,
-        **units_of_verdict(log),
+        size=spreads(data, "q", "p"),
+        bounded=np.array([joint != "revolute" for joint in log.needs.joints] + [True] * d),
+        noise=log.state_noise,
+        measured=np.repeat([True, "p" not in data.estimated], d),
         fitted=samples_fitted(log, fit),
-        rates=rates_unexplained(log, rates, fit.velocities),
+        rates=unexplained,
     )
     latency = one_step(run.flow.rates, list(zip(truth.q[0, :256], truth.p[0, :256], strict=True)), calls=2000)
     metrics = {
@@ -93,10 +106,24 @@ def evaluate(log: PhaseLog, fit: PhaseFit) -> Report:
     for key, value in metrics.items():
         label, unit = METRICS.get(key, (key.replace("_", " "), ""))
         rows.append((label, f"{value:.4g}", unit))
+    failed = fit.stop == "not finite"
+    return Report(
+        metrics=metrics | {"verdict": verdict.number},
+        rows=rows,
+        title=f"test motions of {log.name}, f64",
+        verdict=verdict,
+        figures=figures_of(log, fit, predicted[0], rates),
+        chosen=fit.description,
+        lines=(fit.remark,) if fit.remark and not failed else (),
+        error=fit.remark if failed else "",
+    )
 
+
+def figures_of(log: PhaseLog, fit: PhaseFit, predicted: Motions, rates: Field) -> dict[str, Callable[[Path], None]]:
+    """The applicable figures and films of the first motion, with its energy or, if unknown, the first coordinate."""
+    name, H, truth = fit.description["name"], log.energy, log.truth[0]
     of_q, of_p = UNITS[log.needs.joints[0]]
-    name, H = run.description["name"], log.energy
-    motions = {TRUTH: truth, name: predicted[0]}
+    motions = {TRUTH: truth, name: predicted}
     heights = {key: moved.q[:, :, 0] if H is None else energies(H, moved) for key, moved in motions.items()}
     quantity, units = ("q1", (of_q, f"{of_q}/s", of_q)) if H is None else ("true energy", (of_q, of_p, "J"))
     stride = max(1, len(truth.t) // GIF_FRAMES)
@@ -109,22 +136,12 @@ def evaluate(log: PhaseLog, fit: PhaseFit) -> Report:
         named = [at._replace(stage=LOSSES[at.stage]) for at in fit.history]
         words = {"error": "loss", "loss": "training loss", "unit": "loss, of each stage in its own units"}
         figures["training.png"] = png(training_curve, named, best_step=best, **words)
-    failed = fit.stop == "not finite"
-    return Report(
-        metrics=metrics | {"verdict": verdict.number},
-        rows=rows,
-        title=f"test motions of {log.name}, f64",
-        verdict=verdict,
-        figures=figures,
-        chosen=run.description,
-        lines=(fit.remark,) if fit.remark and not failed else (),
-        error=fit.remark if failed else "",
-    )
+    return figures
 
 
 def errors(log: PhaseLog, fit: PhaseFit, predicted: list[Motions]) -> dict[str, float]:
     """Errors of the predicted motions and of the field, prediction times, and costs."""
-    model, parameters = fit.run.model, fit.run.parameters
+    model, parameters = fit.model, fit.parameters
     numbers = motion_errors(predicted, log.truth, log.energy, published_energy=log.published_energy)
     if log.tests is not None:
         fitted = log.task.window
@@ -143,7 +160,7 @@ def errors(log: PhaseLog, fit: PhaseFit, predicted: list[Motions]) -> dict[str, 
 
 def predicted_motions(log: PhaseLog, fit: PhaseFit) -> list[Motions]:
     """Predicts the task's motions from their first states; p is the velocity for models with their own momenta."""
-    model, parameters = fit.run.model, fit.run.parameters
+    model, parameters = fit.model, fit.parameters
     if fit.velocities:
         windows = padded([on_grid(true.t, true.q[0], true.p[0]) for true in log.truth])
         moved = predict_measured(model, parameters, windows, fitted=samples_fitted(log, fit), substeps=SUBSTEPS)
@@ -176,30 +193,3 @@ def samples_fitted(log: PhaseLog, fit: PhaseFit) -> int:
 def accelerations(run: Run, q: np.ndarray, qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(qd, qdd) of states, without torques."""
     return np.asarray(qd), np.asarray(jax.vmap(run.dynamics.forward_dynamics)(q, qd, 0 * q))
-
-
-def units_of_verdict(log: PhaseLog) -> dict[str, Any]:
-    """Spread of q and p, which of them are bounded and were measured, and their noise if known."""
-    data, d = log.fitted, log.needs.degrees_of_freedom
-    angles = [joint == "revolute" for joint in log.needs.joints]
-    return {
-        "size": spreads(data, "q", "p"),
-        "bounded": ~np.array(angles + [False] * d),
-        "noise": log.state_noise,
-        "measured": np.repeat([True, "p" not in data.estimated], d),
-    }
-
-
-def rates_unexplained(log: PhaseLog, rates: Field, in_qd: bool) -> np.ndarray:
-    """Shares of the variance of measured rates that the model leaves unexplained at test states.
-
-    The noise of estimated rates is unknown, and velocities are states of models in velocities: these do not count.
-    """
-    data = log.held_out
-    informative = ["qd" not in data.estimated and not in_qd, "pd" not in data.estimated]
-    known = np.repeat(informative, log.needs.degrees_of_freedom)
-    if not known.any():
-        return np.zeros(1)
-    sides = rates(data.q, column(data, "p")), (data.qd, column(data, "pd"))
-    model, true = (np.hstack(side)[:, known] for side in sides)
-    return np.mean((model - true) ** 2, axis=0) / np.var(true, axis=0)

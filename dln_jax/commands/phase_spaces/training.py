@@ -22,10 +22,11 @@ from dln_jax.learning.engine.problem import Problem, Progress, Training, losses,
 from dln_jax.learning.measured_motions import Gauge, cut_measured_windows
 from dln_jax.learning.motions import Weights, Windows, cut_windows
 from dln_jax.learning.rates import match_linear
+from dln_jax.models.model import Model, Parameters
 from dln_jax.scale.mesh import of_first_process
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import Description, build
-from dln_jax.zoo.run import Run, save
+from dln_jax.zoo.run import save
 
 POLYNOMIAL = "polynomial-hamiltonian"
 """Model whose fit of rates is one least-squares problem."""
@@ -55,8 +56,9 @@ Halves = tuple[Trajectories, Trajectories]
 class PhaseFit(NamedTuple):
     """A trained model."""
 
-    run: Run
-    """The model with its parameters and functions."""
+    description: Description
+    model: Model
+    parameters: Parameters
     velocities: bool
     """Whether the model was fitted in coordinates and velocities."""
     training: Training
@@ -151,7 +153,7 @@ def train(
     Raises:
         InputError: numbers in the data that are too large for a loss.
     """
-    task, seed = log.task, context.seed
+    task, seed, velocities = log.task, context.seed, in_velocities(log, description)
     numbers = [getattr(log.fitted, key) for key in PER_SAMPLE]
     parts = hold_out(log.fitted, VALIDATION_SHARE, seed)
 
@@ -182,7 +184,9 @@ def train(
     stop, remark = first.stop.reason, ""
     if task.trajectory_steps and stop != "not finite":
         left = of_first_process(context.seconds, context.mesh)
-        if rates_are_exact(log, description, parts[1], first):
+        measured = {"qd", "qdd" if velocities else "pd"}.isdisjoint(log.fitted.estimated) and log.weights is not None
+        negligible = EXACT * mean_square_rates(log, description, parts[1])
+        if measured and (log.free_of_noise or first.validation <= negligible):
             stop, remark = "exact", "the measured rates are free of noise or fitted exactly: motions need no fit"
         elif stop == "time" or left <= MOTIONS_COMPILE * (first.compile_seconds or first.train_seconds):
             stop, remark = "time", "out of time after the fit of rates: motions were not fitted"
@@ -193,7 +197,7 @@ def train(
             problem = problem_of_motions(log, description, parts, first.parameters, seed)
             stage, last = MOTIONS, fitted(MOTIONS, problem, task.trajectory_steps, False)
             stop = last.stop.reason
-            if not in_velocities(log, description):
+            if not velocities:
                 last = last._replace(parameters=last.parameters["model"])
             if last.stop.step and np.isfinite(last.validation):
                 done[MOTIONS] = last
@@ -209,13 +213,5 @@ def train(
         raise InputError(remark or "no validation error is finite; look for very large numbers in the data")
     history = one_after_the_other([at._replace(stage=name) for at in one.history] for name, one in done.items())
     compiled = sum(one.compile_seconds for one in done.values())
-    run = Run(build(description), training.parameters, description)
-    return PhaseFit(run, in_velocities(log, description), training, history, compiled, stop, remark)
-
-
-def rates_are_exact(log: PhaseLog, description: Description, validation: Trajectories, first: Training) -> bool:
-    """Whether a fit of measured rates is sufficient: states are free of noise, or its error is negligible."""
-    own = ("qd", "qdd") if in_velocities(log, description) else ("qd", "pd")
-    if log.weights is None or any(key in log.fitted.estimated for key in own):
-        return False
-    return log.free_of_noise or first.validation <= EXACT * mean_square_rates(log, description, validation)
+    model, parameters = build(description), training.parameters
+    return PhaseFit(description, model, parameters, velocities, training, history, compiled, stop, remark)

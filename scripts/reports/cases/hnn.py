@@ -142,14 +142,14 @@ def own_files(
 
 def energy_error(named: PhaseLog, fit: PhaseFit) -> float:
     """Mean square error of the task's energy along motions from its test starts."""
-    run, d = fit.run, named.needs.degrees_of_freedom
+    description, d = fit.description, named.needs.degrees_of_freedom
     order = np.arange(d)
-    if run.description.get("order") == "axes":  # the task's own coordinates go body by body
-        order = order.reshape(-1, run.description["dimension"]).T.ravel()
+    if description.get("order") == "axes":  # the task's own coordinates go body by body
+        order = order.reshape(-1, description["dimension"]).T.ravel()
     back = np.argsort(order)
     predicted = []
     for true in named.truth:
-        moved = predict(run.model, run.parameters, true.q[:, 0, order], true.p[:, 0, order], true.t)
+        moved = predict(fit.model, fit.parameters, true.q[:, 0, order], true.p[:, 0, order], true.t)
         predicted.append(Motions(moved.t, moved.q[..., back], moved.p[..., back]))
     return motion_errors(predicted, named.truth, named.energy)["energy_mse"]
 
