@@ -200,18 +200,18 @@ def main(options: Options) -> None:
         if getattr(options, name, None) is not None and getattr(options, choice_of) not in values:
             option = f"--{name.replace('_', '-')}"
             raise InputError(f"{option} is an option of --{choice_of} {values[0]}; add that, or leave {option} out")
-    optimizer, rate, order = options.optimizer, None, None
+    optimizer, rate = options.optimizer, None
     if isinstance(options, Networks):
         keywords = {name: getattr(options, name) for name in ("width", "depth", "activation", "field")}
         rate = options.learning_rate
     else:
         keywords = {"degree": options.degree, "coordinates": options.coordinates}
-    optimiser = optimiser_named(
-        "gauss-newton" if optimizer == "auto" else optimizer, precision="f64", learning_rate=rate
-    )
-    log = read(options)
+    networks = optimizer == "adam" or any(value is not None for value in keywords.values())
     if isinstance(options, Recorded):
-        order = options.order
+        keywords["order"] = options.order
+    name = "gauss-newton" if optimizer == "auto" else optimizer
+    optimiser = optimiser_named(name, precision="f64", learning_rate=rate)
+    log = read(options)
     if options.model == POLYNOMIAL:
         if optimizer == "adam":
             raise InputError("the polynomial model is one least-squares problem; leave --optimizer out")
@@ -221,10 +221,9 @@ def main(options: Options) -> None:
     with command_folder(options, "train_hnn_task") as folder:
         context = Context(options.seed, until, print, progress, folder, options.resume, mesh)
         if options.model == "auto" and not log.task.suits:
-            networks = optimizer == "adam" or any(value is not None for value in keywords.values())
-            description = choose_model(log, context, networks=networks, order=order, **keywords)
+            description = choose_model(log, context, networks=networks, **keywords)
         else:
-            description = description_of(log, options.model, order=order, **keywords)
+            description = description_of(log, options.model, **keywords)
         for line in lines_on(log, description):
             print(line)
         fit = train(log, description, context, optimiser=optimiser, steps=options.steps)
@@ -239,15 +238,15 @@ def main(options: Options) -> None:
 
 def read(options: Options) -> "PhaseLog":
     """The motions of the task."""
-    from dln_jax.commands.phase_spaces.data import generated, recorded
+    from dln_jax.commands.phase_spaces.data import generate, read_motions
     from dln_jax.runs.arguments import numbers_of
     from dln_jax.runs.logs import facts, needs_of
 
     if not isinstance(options, Recorded):
-        return generated(options.task, options.trajectories)
+        return generate(options.task, options.trajectories)
     noise = None if options.noise is None else numbers_of("--noise", options.noise, positive=True)
     known = {"needs": needs_of(options.needs), "test": options.test, "noise": noise}
-    return recorded(options.task, options.data, **known, **facts(options))
+    return read_motions(options.task, options.data, **known, **facts(options))
 
 
 def lines_on(log: "PhaseLog", description: dict[str, Any]) -> Iterator[str]:

@@ -35,7 +35,7 @@ def workplace(folder):
 
 
 def test_measured_motions_are_cut_at_gaps(workplace):
-    log = phase_data.recorded(phase_data.REAL, workplace / "swing.npz")
+    log = phase_data.read_motions(phase_data.REAL, workplace / "swing.npz")
     fitted = log.fitted
     assert np.diff(fitted.t)[np.diff(fitted.trajectory) == 0].max() < 0.2 and len(np.unique(fitted.trajectory)) > 2
     # A fifth of the samples is the test, predicted from its first state.

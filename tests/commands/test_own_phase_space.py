@@ -10,7 +10,7 @@ from published_motions import PUBLISHED, published_arrays
 
 from dln_jax import Needs, load
 from dln_jax.commands import train_hnn, train_hnn_task
-from dln_jax.commands.phase_spaces.data import MEASURED, TASKS, recorded
+from dln_jax.commands.phase_spaces.data import MEASURED, TASKS, read_motions
 from dln_jax.commands.phase_spaces.models import description_of
 
 TASK = "--task measured --no-figures --data"
@@ -25,7 +25,7 @@ def files(folder):
 
 
 def own(name, **stated):
-    return recorded(MEASURED, Path(f"{name}.npz").absolute(), needs=SLIDING, **stated)
+    return read_motions(MEASURED, Path(f"{name}.npz").absolute(), needs=SLIDING, **stated)
 
 
 def test_noise_of_states_and_rates_weighs_motions(files):
@@ -86,7 +86,7 @@ def test_order_that_forces_do_not_show_is_asked_for(files, capsys):
     still = ("--needs", '{"joints": ["prismatic", "prismatic", "prismatic", "prismatic"]}', "--out", "none")
     line = refused(capsys, train_hnn_task, TASK, "shuffled.npz", "--model pairwise-hnn", *still)
     assert "state --order bodies (x1, y1, x2, y2) or --order axes" in line
-    log = recorded(MEASURED, files / "orbits.npz")
+    log = read_motions(MEASURED, files / "orbits.npz")
     assert description_of(log, "pairwise-hnn", order="bodies")["order"] == "bodies"
 
 

@@ -152,7 +152,7 @@ class PhaseLog(NamedTuple):
     """Lines on how the file was read, and what its check found."""
 
 
-def generated(name: str, trajectories: int | None = None) -> PhaseLog:
+def generate(name: str, trajectories: int | None = None) -> PhaseLog:
     """A generated task, with its exact field; the data are those of seed 0.
 
     Raises:
@@ -179,7 +179,7 @@ def generated(name: str, trajectories: int | None = None) -> PhaseLog:
     )
 
 
-def recorded(
+def read_motions(
     name: str,
     path: str | Path | None,
     *,
@@ -214,7 +214,7 @@ def recorded(
     if noise is not None and len(noise) not in ((1, d, 2 * d) if momenta else (1, d)):
         more = f", or {2 * d} of q and then p" if momenta else ""
         raise InputError(f"noise has {len(noise)} numbers; expected one, or one for each of {d} coordinates{more}")
-    fitted, held_out, remarks = fitted_and_test(log.data, log.name, test, task.window)
+    fitted, held_out, remarks = split_test(log.data, log.name, test, task.window)
     of_coordinates = None
     if estimates and not momenta:
         fitted, of_coordinates = with_rates(fitted, noise)
@@ -268,7 +268,7 @@ def forces_of(data: Trajectories) -> np.ndarray:
     return data.qdd if data.pd is None else data.pd
 
 
-def fitted_and_test(
+def split_test(
     data: Trajectories, file: str, test: str | None, window: int
 ) -> tuple[Trajectories, Trajectories, tuple[str, ...]]:
     """Training and test trajectories, and remarks on a test file.

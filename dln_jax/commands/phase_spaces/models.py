@@ -118,7 +118,7 @@ def choose_model(
     descriptions = candidates(log, networks, order, stated)
     names = [words_of(description) for description in descriptions]
     if len(descriptions) == 1:
-        if biased(log):
+        if has_biased_rates(log):
             context.say(
                 f"auto: {names[0]}; the states are noisy, so that errors of rates cannot rank models: "
                 f"try --model {POLYNOMIAL} as well"
@@ -154,7 +154,7 @@ def words_of(description: Description) -> str:
     return ", ".join([description["name"], *more, *["with friction"] * description["needs"]["friction"]])
 
 
-def biased(log: PhaseLog) -> bool:
+def has_biased_rates(log: PhaseLog) -> bool:
     """Whether rates were measured with states so noisy that a fit of the rates is biased."""
     return log.noise is None and log.weights is not None and not log.free_of_noise
 
@@ -168,7 +168,7 @@ def candidates(log: PhaseLog, networks: bool, order: Order | None, stated: dict[
     needs, d = log.needs, log.needs.degrees_of_freedom
     if set(needs.joints) == {"prismatic"} and not needs.friction and find_bodies(forces_of(log.fitted)):
         return [description_of(log, PAIRWISE, order=order, alike=alike, **stated) for alike in (True, False)]
-    if biased(log):
+    if has_biased_rates(log):
         # Assumed friction has one coefficient per coordinate.
         friction = {"friction_width": 0} if log.assumed else {}
         return [description_of(log, "separable-hnn" if d == 1 else "structured-hnn", **friction, **stated)]

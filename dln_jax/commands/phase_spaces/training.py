@@ -157,7 +157,7 @@ def train(
     numbers = [getattr(log.fitted, key) for key in PER_SAMPLE]
     parts = hold_out(log.fitted, VALIDATION_SHARE, seed)
 
-    def fitted(stage: str, problem: Problem, most: int, must_start: bool) -> Training:
+    def fit_stage(stage: str, problem: Problem, most: int, must_start: bool) -> Training:
         own = optimiser._replace(steps=steps or most)
         if isinstance(own, Adam):
             own = own._replace(patience=own.steps, batch=WINDOWS_OF_A_STEP if stage == MOTIONS else own.batch)
@@ -179,7 +179,7 @@ def train(
     if description["name"] == POLYNOMIAL:
         first = match_linear(build(description), parts[0], validation=parts[1])[0]
     else:
-        first = fitted(RATES, problem_of_rates(log, description, parts, seed), task.steps, True)
+        first = fit_stage(RATES, problem_of_rates(log, description, parts, seed), task.steps, True)
     done, stage, last = {RATES: first}, RATES, first
     stop, remark = first.stop.reason, ""
     if task.trajectory_steps and stop != "not finite":
@@ -195,7 +195,7 @@ def train(
                 save(context.folder, description, first.parameters)
                 context.say(f"{context.folder} holds the model of the fit of rates; the fit of motions begins")
             problem = problem_of_motions(log, description, parts, first.parameters, seed)
-            stage, last = MOTIONS, fitted(MOTIONS, problem, task.trajectory_steps, False)
+            stage, last = MOTIONS, fit_stage(MOTIONS, problem, task.trajectory_steps, False)
             stop = last.stop.reason
             if not velocities:
                 last = last._replace(parameters=last.parameters["model"])

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.commands.phase_spaces.data import MEASURED, REAL, PhaseLog, generated, recorded
+from dln_jax.commands.phase_spaces.data import MEASURED, REAL, PhaseLog, generate, read_motions
 from dln_jax.commands.phase_spaces.models import choose_model, description_of
 from dln_jax.commands.phase_spaces.results import errors, predicted_motions
 from dln_jax.commands.phase_spaces.training import POLYNOMIAL, PhaseFit, train
@@ -60,12 +60,12 @@ def phase_task(*, task: str, seeds: int = 3, steps: int | None = None, trajector
 
     `steps` of a fit default to the task's own and `trajectories` to the published number.
     """
-    return measured(generated(task, trajectories), seeds, steps)
+    return measured(generate(task, trajectories), seeds, steps)
 
 
 def real_pendulum(*, real_pendulum: Path | None = None, seeds: int = 3, steps: int | None = None) -> Numbers:
     """The same for the measured pendulum (Schmidt and Lipson 2009), whose npz is no part of the project."""
-    return {} if real_pendulum is None else measured(recorded(REAL, real_pendulum), seeds, steps)
+    return {} if real_pendulum is None else measured(read_motions(REAL, real_pendulum), seeds, steps)
 
 
 def measured(log: PhaseLog, seeds: int, steps: int | None) -> Numbers:
@@ -120,12 +120,12 @@ def own_files(
         )
     numbers = {}
     for task, paths in files.items():
-        named = generated(task)
+        named = generate(task)
         recipe = description_of(named, "auto")
         fits: list[tuple[str, PhaseLog, dict[str, Any], int]] = [("named-task", named, recipe, k) for k in range(seeds)]
         for path in paths:
-            stated = recorded(MEASURED, path, needs=named.needs)
-            own_data = {"own-files": stated, "own-files-without-needs": recorded(MEASURED, path)}
+            stated = read_motions(MEASURED, path, needs=named.needs)
+            own_data = {"own-files": stated, "own-files-without-needs": read_motions(MEASURED, path)}
             fits += [(kind, one, choose_model(one), 0) for kind, one in own_data.items()]
             if named.task.weights is not None:  # the task has noise
                 fits.append(("named-recipe-on-the-files", named._replace(fitted=stated.fitted), recipe, 0))
