@@ -15,7 +15,7 @@ from jax import Array
 
 from dln_jax.data import schema
 from dln_jax.data.arrays import spread
-from dln_jax.data.bodies import find_bodies
+from dln_jax.data.bodies import Bodies, Order, find_bodies
 from dln_jax.data.encoders.local_polynomials import SHORTEST, smooth_locally
 from dln_jax.data.log import ASSUMED, NOISY, read_log
 from dln_jax.data.repeated_motions import motion_numbers
@@ -258,14 +258,14 @@ def read_motions(
 def assumed_needs(data: Trajectories) -> Needs:
     """Prismatic coordinates if the measured forces balance as between bodies, else revolute joints with friction."""
     d = data.degrees_of_freedom
-    if find_bodies(forces_of(data)) is not None:
+    if bodies_of(data) is not None:
         return Needs(joints=("prismatic",) * d)
     return Needs(joints=("revolute",) * d, friction=True)
 
 
-def forces_of(data: Trajectories) -> np.ndarray:
-    """pd if known, else accelerations: forces up to the masses."""
-    return data.qdd if data.pd is None else data.pd
+def bodies_of(data: Trajectories, order: Order | None = None) -> Bodies | None:
+    """The arrangement in which the forces on bodies balance; forces are pd, else accelerations, up to the masses."""
+    return find_bodies(data.qdd if data.pd is None else data.pd, order=order)
 
 
 def split_test(
@@ -361,9 +361,10 @@ def weights_of(data: Trajectories, noise: tuple[float, ...] | None) -> dict[str,
     deviation = np.concatenate([smooth.noise for smooth in found])
     resolved = np.concatenate([smooth.resolved for smooth in found])
     measured = np.repeat([key not in data.estimated for key in keys], d)
-    least = np.repeat([FREE_OF_NOISE, FREE_OF_NOISE, LEAST_RATE_NOISE, LEAST_RATE_NOISE], d)
-    of_estimates = np.repeat([1.0, ANCHOR, np.inf, np.inf], d)
-    limited = np.where(measured, np.maximum(deviation, least * size), of_estimates * size)
+    of_states = np.arange(4 * d) < 2 * d
+    least = np.where(of_states, FREE_OF_NOISE, LEAST_RATE_NOISE)
+    of_estimates = np.where(of_states, ANCHOR * size, np.inf)
+    limited = np.where(measured, np.maximum(deviation, least * size), of_estimates)
     known = np.where(measured & resolved, deviation, 0.0)
     if noise is not None:
         stated = slice(0, max(d, len(noise)))

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dln_jax.commands.phase_spaces.data import PhaseLog, forces_of
+from dln_jax.commands.phase_spaces.data import PhaseLog, bodies_of
 from dln_jax.commands.phase_spaces.training import (
     EXACT,
     IN_VELOCITIES,
@@ -17,7 +17,7 @@ from dln_jax.commands.phase_spaces.training import (
     mean_square_rates,
     problem_of_rates,
 )
-from dln_jax.data.bodies import Order, arrangements, find_bodies
+from dln_jax.data.bodies import Order, arrangements
 from dln_jax.data.schema import column
 from dln_jax.data.splits import hold_out
 from dln_jax.learning import accelerations
@@ -54,7 +54,7 @@ def description_of(log: PhaseLog, model: str, *, order: Order | None = None, **s
 
     Args:
         log: the data of the task.
-        model: a name of the catalogue; "auto" for the one that suits the task.
+        model: a name of the catalogue; "auto" for the one that suits the task, if it is not that of any plant.
         order: order of the coordinates of bodies (default: the one in which their forces balance).
         stated: keywords of the model (width, depth, activation, degree, coordinates, field); those that are `None`
             take the task's or the model's defaults.
@@ -76,7 +76,7 @@ def description_of(log: PhaseLog, model: str, *, order: Order | None = None, **s
             values["friction_width"] = FRICTION_WIDTH
     # The model itself refuses other joints.
     if name == PAIRWISE and set(needs.joints) == {"prismatic"} and arrangements(needs.degrees_of_freedom):
-        bodies = find_bodies(forces_of(log.fitted), order=order)
+        bodies = bodies_of(log.fitted, order)
         if bodies is None:
             raise InputError(
                 f"the forces along {needs.degrees_of_freedom} coordinates do not show which of them belong to one "
@@ -166,7 +166,7 @@ def candidates(log: PhaseLog, networks: bool, order: Order | None, stated: dict[
     models of rates. Noisy states rule out the comparison: they bias all fits, those of flexible models the least.
     """
     needs, d = log.needs, log.needs.degrees_of_freedom
-    if set(needs.joints) == {"prismatic"} and not needs.friction and find_bodies(forces_of(log.fitted)):
+    if set(needs.joints) == {"prismatic"} and not needs.friction and bodies_of(log.fitted):
         return [description_of(log, PAIRWISE, order=order, alike=alike, **stated) for alike in (True, False)]
     if has_biased_rates(log):
         # Assumed friction has one coefficient per coordinate.
