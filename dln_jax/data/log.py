@@ -1,6 +1,6 @@
 """Reads a log and all that is known of it: joints and terms of the plant, robot, filter, findings of the check."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -29,6 +29,8 @@ FILTERED = (
 """Checks for faults that filtering q replaces or repairs."""
 SPLIT = ("split", "repeated-motions")
 """Checks for faults that `data.splits.split_log` settles."""
+ASSUMED = "assumed: neither the file nor --needs says"
+"""Origin of needs that nobody states."""
 
 
 class Log(NamedTuple):
@@ -98,7 +100,7 @@ def read_log(
         joints: joints to keep, in this order; "LOG=NAME" renames one.
         topics: ROS bag: topics of joint states (default: the only one).
         torque_factor: factor of tau, such as N m per A: one, one per joint, or by name.
-        known: needs, needs_origin, driven, cutoff, decimate, settled and accept_log, as for `log_of`.
+        known: needs, needs_origin, assume, driven, cutoff, decimate, settled and accept_log, as for `log_of`.
 
     Raises:
         InputError: a file that is missing, damaged or of another schema; joints that are not the robot's; and as for
@@ -119,6 +121,7 @@ def log_of(
     robot: Robot | None = None,
     needs: Needs | None = None,
     needs_origin: str = "--needs",
+    assume: Callable[[Trajectories], Needs] | None = None,
     driven: bool = True,
     cutoff: float | Literal["auto"] | None = None,
     decimate: int = 1,
@@ -136,7 +139,8 @@ def log_of(
         needs: joints and terms of the plant (default: those of the data, else of the robot, else revolute joints with
             gravity; the last two with friction).
         needs_origin: who states `needs`.
-        driven: whether the motions need torques.
+        assume: trajectories -> needs that nobody states (default: revolute joints with gravity and friction).
+        driven: whether the motions need torques; without, they must have none, and rates are the command's concern.
         cutoff: low-pass q at this frequency, Hz, and derive the rates; "auto" chooses it from the data, inf leaves q as
             it is (default: the rates of the data; "auto" if it has none and the noise of q matters).
         decimate: with a cut-off, keep every n-th sample.
@@ -147,7 +151,7 @@ def log_of(
 
     Raises:
         InputError: needs, joints of the data and of the robot that contradict each other, no torques although
-            `driven`, a cut-off that the data cannot be filtered at, or a log with an error.
+            `driven` or torques although not, a cut-off that the data cannot be filtered at, or a log with an error.
     """
     if robot is not None and robot.tree.names:
         try:
@@ -160,7 +164,9 @@ def log_of(
             f"{name}: there is no tau, which models of torques are fitted to; add the measured torques, or fit motions "
             f"without applied forces by: python -m scripts.train_hnn_task --task measured --data {name}{remarks}"
         )
-    needs, origin = (needs, needs_origin) if needs is not None else known_needs(data, robot)
+    if not driven and np.any(data.tau):
+        raise InputError(f"{name} has applied forces tau, unlike free motions; train it by train_hnn --data {name}")
+    needs, origin = (needs, needs_origin) if needs is not None else known_needs(data, robot, assume)
     if needs.degrees_of_freedom != data.degrees_of_freedom:
         raise InputError(
             f"{origin} has {needs.degrees_of_freedom} joints, but {name} has {data.degrees_of_freedom}; make them agree"
@@ -185,7 +191,7 @@ def log_of(
         # Splines through q keep its noise.
         ignored |= {check for check in FILTERED if check != NOISY or np.isfinite(smoothed.cutoff)}
     findings = [finding for finding in findings if finding.check not in ignored]
-    remarks = list(preparation(data, smoothed))
+    remarks = list(preparation(data, smoothed) if driven else data.remarks)
     if cutoff is None and smoothed is not None:
         remarks.insert(0, f"q is filtered before it is differentiated: {noisy[0]} (--cutoff inf leaves q as it is)")
     remarks += lines_on(findings, name, accept_log, f"python -m scripts.check_data --data {name}{more}")
@@ -205,14 +211,17 @@ def log_of(
     )
 
 
-def known_needs(data: Trajectories, robot: Robot | None) -> tuple[Needs, str]:
+def known_needs(
+    data: Trajectories, robot: Robot | None, assume: Callable[[Trajectories], Needs] | None = None
+) -> tuple[Needs, str]:
     """Joints and terms of a plant that nobody states, and where they come from."""
     if data.needs is not None:
         return data.needs, "the data file"
     if robot is not None:
         return robot.tree.needs._replace(joint_friction=USUAL), "the robot's file, and friction"
-    needs = Needs(joints=("revolute",) * data.degrees_of_freedom, joint_friction=USUAL)
-    return needs, "assumed: neither the file nor --needs says"
+    if assume is not None:
+        return assume(data), ASSUMED
+    return Needs(joints=("revolute",) * data.degrees_of_freedom, joint_friction=USUAL), ASSUMED
 
 
 def preparation(data: Trajectories, smoothed: Smoothed | None) -> list[str]:

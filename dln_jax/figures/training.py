@@ -11,6 +11,8 @@ from dln_jax.learning.engine.problem import Progress
 
 SHORTEST_SHARE = 0.2
 """If a stage is shorter than this fraction of the steps, the stage names are vertical."""
+OF_LOSSES = {"error": "loss", "loss": "training loss"}
+"""Labels of a curve that shows losses."""
 
 
 def training_curve(

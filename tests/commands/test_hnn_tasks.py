@@ -7,16 +7,12 @@ from motions import quick_motion
 
 from dln_jax import load
 from dln_jax.commands import train_hnn_task
+from dln_jax.commands.phase_spaces import data as phase_data
+from dln_jax.commands.phase_spaces import results
 from dln_jax.data import schema
 from dln_jax.mechanics.dynamics import Flow
 from dln_jax.mechanics.equations import hamiltonian_of
 from dln_jax.metrics.phase_space import Motions
-from dln_jax.training.hamiltonian import measurements, predictions, stages
-from dln_jax.training.hamiltonian import model_selection as choice
-from dln_jax.training.hamiltonian import tasks as hnn_tasks
-from dln_jax.training.hamiltonian import training as hnn_models
-from dln_jax.training.hamiltonian.tasks import problem_of
-from dln_jax.training.hamiltonian.training import RECIPES
 
 
 def quick_prediction(model, parameters, q, p, t):
@@ -26,29 +22,25 @@ def quick_prediction(model, parameters, q, p, t):
 
 @pytest.fixture(scope="module")
 def workplace(folder):
-    """A damped pendulum with gaps in place of the measured one, and recipes that take a moment."""
+    """A damped pendulum with gaps in place of the measured one, and tasks that take a moment."""
     t = np.arange(160) / 6
     t[40:] += 1 / 6
     q = (2 * np.exp(-0.02 * t) * np.cos(2 * t))[:, None]
     schema.save(folder / "swing.npz", schema.from_arrays({"t": t, "q": q, "trajectory": np.zeros(160)}))
     sizes = {"width": 2, "depth": 1, "network": 3, "network_depth": 1, "window": 6, "substeps": 1}
-    small = {name: recipe._replace(**sizes, trajectory_steps=1) for name, recipe in RECIPES.items()}
-    window = dict.fromkeys(hnn_tasks.WINDOW, 6)
+    small = {name: task._replace(**sizes, trajectory_steps=1) for name, task in phase_data.TASKS.items()}
     with pytest.MonkeyPatch.context() as patch:
-        for module in (hnn_models, stages, choice):
-            patch.setattr(module, "RECIPES", small)
-        for module in (hnn_tasks, measurements):
-            patch.setattr(module, "WINDOW", window)
-        patch.setattr(predictions, "predict", quick_prediction)
+        patch.setattr(phase_data, "TASKS", small)
+        patch.setattr(results, "predict", quick_prediction)
         yield folder
 
 
 def test_measured_motions_are_cut_at_gaps(workplace):
-    problem = problem_of(hnn_tasks.REAL, data=workplace / "swing.npz")
-    fitted = problem.fitted
+    log = phase_data.read_motions(phase_data.REAL, workplace / "swing.npz")
+    fitted = log.fitted
     assert np.diff(fitted.t)[np.diff(fitted.trajectory) == 0].max() < 0.2 and len(np.unique(fitted.trajectory)) > 2
     # A fifth of the samples is the test, predicted from its first state.
-    assert problem.truth[0].q.shape == (1, 32, 1) and len(fitted.t) == 128 and problem.truth[0].t[0] == 0
+    assert log.truth[0].q.shape == (1, 32, 1) and len(fitted.t) == 128 and log.truth[0].t[0] == 0
     np.testing.assert_array_equal(fitted.p, fitted.qd)
 
 
@@ -69,13 +61,10 @@ OWN = "--task measured --data positions.npz"
 SLIDING = ("--needs", '{"joints": ["prismatic"]}')
 
 
-def test_own_positions_train_and_resume_to_the_same_model(positions, capsys, monkeypatch):
-    """A recipe's time is that of the table: it does not end the fit."""
-    slow = {name: recipe._replace(seconds=1e-6) for name, recipe in hnn_models.RECIPES.items()}
-    monkeypatch.setattr(hnn_models, "RECIPES", slow)
+def test_own_positions_train_and_resume_to_the_same_model(positions, capsys):
     command(train_hnn_task, OWN, *SLIDING, "--optimizer adam --steps 2 --no-figures --out whole")
     out = capsys.readouterr().out
-    assert "finite differences" in out and "out of time" not in out
+    assert "finite differences" in out
     assert "2/2 steps  rates: loss" in out and "2/2 steps  motions: loss" in out
     metrics = json_of(positions / "whole/metrics.json")
     assert {"rollout_mse", "train_seconds", "validation_error"} <= set(metrics) and "energy_mse" not in metrics
@@ -98,10 +87,14 @@ def test_what_a_task_does_not_take_is_one_line(positions, capsys):
         ("--task spring --test a", "--test is an option of --task measured"),
         ("--task spring", *SLIDING, "--needs is an option of --task measured"),
         ("--task spring --model trigonometric", "is of no phase space"),
-        (OWN, "--needs", '{"joints": ["revolute", "revolute"]}', "have 2 joints"),
+        (OWN, "--needs", '{"joints": ["revolute", "revolute"]}', "has 2 joints"),
         (OWN, "--noise small", "--noise is 'small'"),
         (OWN, "--noise 0", "finite positive numbers"),
-        (OWN, "--coordinates absolute", "--coordinates is an option of --model planar-chain"),
+        (
+            OWN,
+            "--coordinates absolute",
+            "--coordinates is an option of --model polynomial-hamiltonian or trigonometric or planar-chain",
+        ),
     ]
     assert_refused(capsys, train_hnn_task, rows, out=positions / "none")
     rows = {

@@ -10,10 +10,8 @@ from published_motions import PUBLISHED, published_arrays
 
 from dln_jax import Needs, load
 from dln_jax.commands import train_hnn, train_hnn_task
-from dln_jax.training.hamiltonian import recipes
-from dln_jax.training.hamiltonian.model_selection import description_of
-from dln_jax.training.hamiltonian.results import units_of_judgement
-from dln_jax.training.hamiltonian.tasks import MEASURED, Stated, problem_of
+from dln_jax.commands.phase_spaces.data import MEASURED, TASKS, read_motions
+from dln_jax.commands.phase_spaces.models import description_of
 
 TASK = "--task measured --no-figures --data"
 SLIDING = Needs(joints=("prismatic",))
@@ -26,17 +24,17 @@ def files(folder):
     return folder
 
 
-def own_problem(name, **stated):
-    return problem_of(MEASURED, data=Path(f"{name}.npz").absolute(), stated=Stated(SLIDING, **stated))
+def own(name, **stated):
+    return read_motions(MEASURED, Path(f"{name}.npz").absolute(), needs=SLIDING, **stated)
 
 
 def test_noise_of_states_and_rates_weighs_motions(files):
     """Own data show what the named task states: sd 0.1 of q and p, and exact rates."""
-    problem = own_problem("spring")
-    weights, named = problem.trust.weights, recipes.RECIPES["spring"].weights
-    assert not problem.trust.free_of_noise and named.rate == 0.01
+    log = own("spring")
+    weights, named = log.weights, TASKS["spring"].weights
+    assert not log.free_of_noise and named.rate == 0.01
     assert_allclose(weights.state, 0.1, rtol=0.15)
-    assert_allclose(units_of_judgement(problem)["noise"], 0.1, rtol=0.15)
+    assert_allclose(log.state_noise, 0.1, rtol=0.15)
     assert np.all(np.abs(np.log2(np.divide(weights.rate, named.rate))) < 1)
 
 
@@ -45,19 +43,18 @@ def test_noise_that_nobody_measured_is_none(files):
     t = np.arange(0, 20, 0.25)
     q = np.cos(4 * t + np.arange(6)[:, None]).reshape(-1, 1)
     np.savez("coarse.npz", t=np.tile(t, 6), q=q, trajectory=np.repeat(np.arange(6), len(t)))
-    problem = own_problem("coarse")
-    known = units_of_judgement(problem)
-    assert not problem.trust.noise.any() and known["measured"].tolist() == [True, False] and not np.any(known["noise"])
+    log = own("coarse")
+    assert not log.state_noise.any() and "p" in log.fitted.estimated
 
 
 def test_stated_noise_is_used_or_refused(files, capsys):
-    one, two = (own_problem("spring", noise=noise).trust.weights for noise in ((0.3,), (0.3, 0.2)))
+    one, two = (own("spring", noise=noise).weights for noise in ((0.3,), (0.3, 0.2)))
     assert two.state == (0.3, 0.2) and one.state == (0.3, pytest.approx(0.1, rel=0.15))
     line = refused(capsys, train_hnn_task, TASK, "spring.npz", "--noise 0.1,0.1,0.1 --out none")
     assert "noise has 3 numbers; expected one, or one for each of 1 coordinates, or 2 of q and then p" in line
     # A file without torques names the command for it.
     line = refused(capsys, train_hnn, "--data spring.npz --out none")
-    assert "spring.npz has no tau" in line and "train_hnn_task --task measured --data spring.npz" in line
+    assert "spring.npz: there is no tau" in line and "train_hnn_task --task measured --data spring.npz" in line
 
 
 def test_a_file_without_rates_of_momenta_is_no_mass_of_one(files):
@@ -65,8 +62,8 @@ def test_a_file_without_rates_of_momenta_is_no_mass_of_one(files):
     arrays = dict(np.load("spring.npz"))
     arrays.pop("pd")
     np.savez("momenta.npz", **arrays)
-    problem = own_problem("momenta")
-    assert "pd" in problem.fitted.estimated and np.isinf(problem.trust.weights.rate[1])
+    log = own("momenta")
+    assert "pd" in log.fitted.estimated and np.isinf(log.weights.rate[1])
 
 
 def test_own_orbits_axis_by_axis_need_no_motions(files, capsys):
@@ -89,8 +86,8 @@ def test_order_that_forces_do_not_show_is_asked_for(files, capsys):
     still = ("--needs", '{"joints": ["prismatic", "prismatic", "prismatic", "prismatic"]}', "--out", "none")
     line = refused(capsys, train_hnn_task, TASK, "shuffled.npz", "--model pairwise-hnn", *still)
     assert "state --order bodies (x1, y1, x2, y2) or --order axes" in line
-    problem = problem_of(MEASURED, data=files / "orbits.npz")
-    assert description_of(problem, "pairwise-hnn", order="bodies")["order"] == "bodies"
+    log = read_motions(MEASURED, files / "orbits.npz")
+    assert description_of(log, "pairwise-hnn", order="bodies")["order"] == "bodies"
 
 
 def test_a_model_whose_motions_explode_is_refused(files, capsys):

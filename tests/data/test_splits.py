@@ -4,10 +4,10 @@ import numpy as np
 from calls import one_line
 from numpy.testing import assert_array_equal
 
+from dln_jax.commands.phase_spaces.data import split_test
 from dln_jax.data.repeated_motions import motion_numbers, remark_on_repeats
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import hold_out, in_blocks, split, stated_test
-from dln_jax.training.hamiltonian.measurements import parted
 
 
 def fourier(random, d=3):
@@ -114,7 +114,7 @@ def test_one_trajectory_suffices_for_both():
         cut, labels = stated_test(data, text)
         sets = split(cut, test=labels)
         assert len(sets.test.t) == tested and len(sets.validation.t) and len(sets.train.t) > 100
-        assert [len(part.t) for part in parted("measured", data, "log", text)] == [200 - tested, tested]
+        assert [len(part.t) for part in split_test(data, "log", text, 30)[:2]] == [200 - tested, tested]
     blocks = in_blocks(log(6), 3)
     assert blocks.label.tolist() == ["0[0]", "0[1]", "0[2]"] and blocks.trajectory.tolist() == [0, 0, 1, 1, 2, 2]
 

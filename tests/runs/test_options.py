@@ -17,7 +17,6 @@ from dln_jax.runs.arguments import arguments_for, resolved
 from dln_jax.runs.options import SCENES
 from dln_jax.scenes import registry
 from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS
-from dln_jax.training.hamiltonian import options as phase_spaces
 from dln_jax.zoo.catalogue import CATALOGUE
 
 HELP = """
@@ -52,12 +51,12 @@ def shown(options, name):
 def test_names_and_defaults_in_options_are_those_of_the_library():
     assert set(SCENES) == set(registry.SCENES)
     assert set(WAYS) - {"auto"} <= set(CATALOGUE)
-    assert set(phase_spaces.GENERATED) == set(PROTOCOLS)
+    assert set(train_hnn_task.GENERATED) == set(PROTOCOLS)
     assert set(train_diffnet.NAMES) == set(PUBLISHED)
     assert set(identify.LAWS) == set(LAWS)
     assert shown(train_value.TrainingOptions, "plant") == {*PLANTS, "FILE"}
     assert shown(train_diffnet.Arguments, "activation") == set(ALL)
-    assert set(get_args(get_type_hints(phase_spaces.Motion)["model"])) - {"auto"} <= set(CATALOGUE)
+    assert set(get_args(get_type_hints(train_hnn_task.Motion)["model"])) - {"auto"} <= set(CATALOGUE)
     defaults = {field.name: field.default for field in dataclasses.fields(identify.Arguments)}
     assert defaults["friction"] == ",".join(USUAL)
 
@@ -67,8 +66,8 @@ def test_an_option_exists_for_the_choices_that_read_it():
         (train_delan, {}, "width target scene batch", "robot degree"),
         (train_delan, {"data": "log.npz"}, "robot parents seconds", "width optimizer"),
         (train_delan, {"model": "trigonometric"}, "degree objective", "width seconds seeds"),
-        (train_hnn_task, {}, "trajectories width", "data noise learning_rate degree"),
-        (train_hnn_task, {"task": "measured"}, "data noise order", "trajectories field"),
+        (train_hnn_task, {}, "trajectories width", "data noise degree"),
+        (train_hnn_task, {"task": "measured"}, "data noise order", "trajectories degree"),
         (train_value, {"stored": "run"}, "starts", "plant width seed"),
     ]:
         names = {field.name for field in dataclasses.fields(arguments_for(command.Arguments, stated))}

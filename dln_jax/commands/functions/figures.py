@@ -12,10 +12,9 @@ from matplotlib.patches import Rectangle
 
 from dln_jax.data.functions import FunctionSamples
 from dln_jax.figures import style
-from dln_jax.figures.training import training_curve
+from dln_jax.figures.training import OF_LOSSES, training_curve
 from dln_jax.learning.engine.problem import Training, one_after_the_other
 from dln_jax.learning.select import Trial
-from dln_jax.training.results import OF_LOSSES
 
 MODEL = style.colour("differential-network")
 HALO = {"color": "black", "linewidth": 3.0, "alpha": 0.3}

@@ -14,17 +14,17 @@ from typing import Any
 
 import numpy as np
 
+from dln_jax.commands.phase_spaces.data import MEASURED, REAL, PhaseLog, generate, read_motions
+from dln_jax.commands.phase_spaces.models import choose_model, description_of
+from dln_jax.commands.phase_spaces.results import errors, predicted_motions
+from dln_jax.commands.phase_spaces.training import POLYNOMIAL, PhaseFit, train
 from dln_jax.commands.pixels.fit import fit, measure
 from dln_jax.commands.pixels.frames import TRAJECTORIES, swinging_rod
+from dln_jax.learning.context import Context
 from dln_jax.metrics.phase_space import Motions, motion_errors, predict
 from dln_jax.models.latent_phase import Field
-from dln_jax.training.hamiltonian.model_selection import POLYNOMIAL, choose_model, description_of
-from dln_jax.training.hamiltonian.predictions import measured_once
-from dln_jax.training.hamiltonian.recipes import RECIPES
-from dln_jax.training.hamiltonian.tasks import HORIZONS, MEASURED, REAL, Problem, Stated, problem_of
-from dln_jax.training.hamiltonian.training import Trained, train
+from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.types import InputError, require_positive
-from dln_jax.zoo.descriptions import build
 from scripts.reports.run import Case, Numbers
 
 TINY = {"seeds": 1, "steps": 5, "trajectories": 10}
@@ -50,6 +50,8 @@ BOUNDS = {
     "three-body": ("pairwise-hnn", {"energy_mse": 4.2e-3, "energy_mse_median": 4.2e-3, "train_seconds": 300.0}),
     "pixels": ("black-box-hnn", {"energy_mse": 1.5e-4, "energy_mse_over_baseline": 0.1, "train_seconds": 300.0}),
 }
+SECONDS = {"two-body": 25.0, "three-body": 45.0, REAL: 30.0}
+"""Time limits for both fits of a model together, compilation included; 60 s for other tasks."""
 MODELS: tuple[Field, ...] = ("black-box-hnn", "phase-network")
 """Models of every task, in addition to the one that suits the scene."""
 
@@ -59,21 +61,24 @@ def phase_task(*, task: str, seeds: int = 3, steps: int | None = None, trajector
 
     `steps` of a fit default to the task's own and `trajectories` to the published number.
     """
-    return measured(problem_of(task, trajectories=trajectories), seeds, steps)
+    return measured(generate(task, trajectories), seeds, steps)
 
 
 def real_pendulum(*, real_pendulum: Path | None = None, seeds: int = 3, steps: int | None = None) -> Numbers:
     """The same for the measured pendulum (Schmidt and Lipson 2009), whose npz is no part of the project."""
-    return {} if real_pendulum is None else measured(problem_of(REAL, data=real_pendulum), seeds, steps)
+    return {} if real_pendulum is None else measured(read_motions(REAL, real_pendulum), seeds, steps)
 
 
-def measured(problem: Problem, seeds: int, steps: int | None) -> Numbers:
+def measured(log: PhaseLog, seeds: int, steps: int | None) -> Numbers:
     """Medians over seeds, each of which compiles anew, as a user's run does."""
-    recipe, numbers = RECIPES[problem.name], {}
-    for kind in (recipe.suits, *MODELS, *([POLYNOMIAL] if problem.name in ("spring", "pendulum") else [])):
-        description = description_of(problem, kind)
-        fits = (train(problem, description, seed=seed, steps=steps, seconds=recipe.seconds) for seed in range(seeds))
-        numbers[f"{problem.name}/{kind}"] = medians([measured_once(problem, trained)[0] for trained in fits])
+    numbers = {}
+    for kind in (log.task.suits, *MODELS, *([POLYNOMIAL] if log.name in ("spring", "pendulum") else [])):
+        runs, description = [], description_of(log, kind)
+        for seed in range(seeds):
+            context = Context(seed=seed).within(SECONDS.get(log.name, 60.0))
+            fit = train(log, description, context, steps=steps)
+            runs.append(errors(log, fit, predicted_motions(log, fit)))
+        numbers[f"{log.name}/{kind}"] = medians(runs)
     return numbers
 
 
@@ -97,7 +102,7 @@ def medians(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def own_files(
-    *, own: Path | None = None, tasks: tuple[str, ...] = tuple(HORIZONS), seeds: int = 3, steps: int | None = None
+    *, own: Path | None = None, tasks: tuple[str, ...] = tuple(PROTOCOLS), seeds: int = 3, steps: int | None = None
 ) -> Numbers:
     """Energy errors of files TASK-SEED.npz, learned as own data with and without stated needs, and of the named tasks.
 
@@ -116,36 +121,36 @@ def own_files(
         )
     numbers = {}
     for task, paths in files.items():
-        named = problem_of(task)
+        named = generate(task)
         recipe = description_of(named, "auto")
-        fits: list[tuple[str, Problem, dict[str, Any], int]] = [("named-task", named, recipe, k) for k in range(seeds)]
+        fits: list[tuple[str, PhaseLog, dict[str, Any], int]] = [("named-task", named, recipe, k) for k in range(seeds)]
         for path in paths:
-            stated = problem_of(MEASURED, data=path, stated=Stated(named.needs))
-            own_data = {"own-files": stated, "own-files-without-needs": problem_of(MEASURED, data=path)}
-            fits += [(kind, one, choose_model(one, precision="f64"), 0) for kind, one in own_data.items()]
-            if RECIPES[task].weights is not None:  # the task has noise
+            stated = read_motions(MEASURED, path, needs=named.needs)
+            own_data = {"own-files": stated, "own-files-without-needs": read_motions(MEASURED, path)}
+            fits += [(kind, one, choose_model(one), 0) for kind, one in own_data.items()]
+            if named.task.weights is not None:  # the task has noise
                 fits.append(("named-recipe-on-the-files", named._replace(fitted=stated.fitted), recipe, 0))
-        errors: dict[str, list[float]] = {}
-        for kind, problem, description, seed in fits:
-            trained = train(problem, description, seed=seed, steps=steps)
-            errors.setdefault(kind, []).append(energy_error(named, trained))
-        for kind, values in errors.items():
+        of_kinds: dict[str, list[float]] = {}
+        for kind, log, description, seed in fits:
+            fit = train(log, description, Context(seed=seed), steps=steps)
+            of_kinds.setdefault(kind, []).append(energy_error(named, fit))
+        for kind, values in of_kinds.items():
             row = {"energy_mse": np.median(values), "energy_mse_largest": max(values), "trainings": len(values)}
-            over = {"over_named_task": np.median(values) / np.median(errors["named-task"])}
+            over = {"over_named_task": np.median(values) / np.median(of_kinds["named-task"])}
             numbers[f"{task}/{kind}"] = row | (over if kind.startswith("own-files") else {})
     return numbers
 
 
-def energy_error(named: Problem, trained: Trained) -> float:
+def energy_error(named: PhaseLog, fit: PhaseFit) -> float:
     """Mean square error of the task's energy along motions from its test starts."""
-    description, d = trained.description, named.needs.degrees_of_freedom
+    description, d = fit.description, named.needs.degrees_of_freedom
     order = np.arange(d)
     if description.get("order") == "axes":  # the task's own coordinates go body by body
         order = order.reshape(-1, description["dimension"]).T.ravel()
-    model, back = build(description), np.argsort(order)
+    back = np.argsort(order)
     predicted = []
     for true in named.truth:
-        moved = predict(model, trained.result.parameters, true.q[:, 0, order], true.p[:, 0, order], true.t)
+        moved = predict(fit.model, fit.parameters, true.q[:, 0, order], true.p[:, 0, order], true.t)
         predicted.append(Motions(moved.t, moved.q[..., back], moved.p[..., back]))
     return motion_errors(predicted, named.truth, named.energy)["energy_mse"]
 

@@ -1,0 +1,1 @@
+"""Hamiltonian training on motions without applied forces: a user's own, and published tasks."""

@@ -1,1 +1,0 @@
-"""Training: from data to a run folder with a model, test errors and figures."""
