@@ -29,6 +29,7 @@ LAYERS = {
     "metrics": 7,
     "export": 7,
     "identification": 7,
+    "learning.fits": 7.5,  # ways of fitting a log, which compare and identify
     "figures": 8,
     "locomotion": 9,
     "runs": 10,  # what commands share

@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from dln_jax.learning.settings import Automatic, Kernel, LearnedTree, Network, Trigonometric
+from dln_jax.learning.fits.settings import Automatic, Kernel, LearnedTree, Network, Trigonometric
 from dln_jax.options import Unstated
 from dln_jax.runs.arguments import Variants
 from dln_jax.runs.options import Devices, Drawn, Filtered, Limited, Resumable, Scaled, SceneName

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from dln_jax.errors import InputError
-from dln_jax.learning.settings import ActivationName
+from dln_jax.learning.fits.settings import ActivationName
 from dln_jax.options import Unstated, choice
 from dln_jax.runs.arguments import Variants
 from dln_jax.runs.options import Checked, Drawn, Limited, Resumable, Scaled

@@ -14,7 +14,7 @@ from dln_jax.data.splits import Split, select_samples
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.learning.context import Context
 from dln_jax.learning.fit import Fit, with_uncertainty
-from dln_jax.learning.settings import WAYS
+from dln_jax.learning.fits.settings import WAYS
 from dln_jax.precision import require_double_precision
 from dln_jax.time_limit import deadline
 from dln_jax.types import InputError
@@ -49,7 +49,7 @@ def train(
         seconds: time limit of the fit.
         uncertainty: estimate the uncertainty of the torques.
         say: takes lines on the progress, such as `print`.
-        settings: fields of the model's class in `learning.settings`, such as `width`. The `optimizer` of a network may
+        settings: fields of the model's class in `learning.fits.settings`, such as `width`. The `optimizer` of a network may
             be any of optax: `optimizer=optax.adam(3e-4), steps=5000`.
 
     Raises:

@@ -17,7 +17,7 @@ from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import Robot
 from dln_jax.learning.context import Context
 from dln_jax.learning.fits import automatic, tree
-from dln_jax.learning.settings import Automatic
+from dln_jax.learning.fits.settings import Automatic
 
 TREE = "--model learned-tree --data rigid.npz"
 PLAIN = '{"joints": ["revolute", "revolute"], "joint_friction": ["viscous"]}'

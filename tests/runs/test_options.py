@@ -10,7 +10,7 @@ from typing import get_args, get_type_hints
 from dln_jax.commands import COMMANDS, identify, train_delan, train_diffnet, train_hnn, train_hnn_task, train_value
 from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.data.functions import PUBLISHED
-from dln_jax.learning.settings import WAYS
+from dln_jax.learning.fits.settings import WAYS
 from dln_jax.mechanics.friction.laws import LAWS, USUAL
 from dln_jax.nn.activations import ALL
 from dln_jax.runs.arguments import arguments_for, resolved

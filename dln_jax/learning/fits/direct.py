@@ -19,6 +19,7 @@ from dln_jax.learning.engine.fit import fit as train
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import one_after_the_other
 from dln_jax.learning.fit import Fit, direct_fit, fit_of
+from dln_jax.learning.fits.settings import Goal, Kernel, Trigonometric
 from dln_jax.learning.gauges import without_offset
 from dln_jax.learning.kernel import choose_kernel, fit_kernel
 from dln_jax.learning.linear import choose_degrees, fit_linear
@@ -31,7 +32,6 @@ from dln_jax.learning.objectives import (
     torque_scale,
 )
 from dln_jax.learning.select import mean_of_segments, select
-from dln_jax.learning.settings import Goal, Kernel, Trigonometric
 from dln_jax.scale.devices import device_lines
 from dln_jax.types import InputError, Needs, require_positive
 from dln_jax.zoo.descriptions import Description, build, describe_for

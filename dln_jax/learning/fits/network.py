@@ -18,12 +18,12 @@ from dln_jax.learning.engine.fit import fit as train
 from dln_jax.learning.engine.optimisers import Optimiser, name_of, optimiser_named
 from dln_jax.learning.engine.problem import Problem, Training, losses
 from dln_jax.learning.fit import Fit, fit_of
+from dln_jax.learning.fits.settings import OF_ADAM, Network
 from dln_jax.learning.gauges import summed_with_friction, without_offset
 from dln_jax.learning.latency import latency_of
 from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, Objective, objective_of
 from dln_jax.learning.select import Trial, lowest, select
 from dln_jax.learning.selection import say_selection
-from dln_jax.learning.settings import OF_ADAM, Network
 from dln_jax.scale.devices import device_lines
 from dln_jax.scale.mesh import of_first_process
 from dln_jax.sizes import require_network

@@ -6,10 +6,10 @@ from dln_jax.files import read_json
 from dln_jax.learning.context import Context
 from dln_jax.learning.fit import Fit, direct_fit
 from dln_jax.learning.fits.direct import goal_of, refined
+from dln_jax.learning.fits.settings import Arm, LearnedTree
 from dln_jax.learning.kinematics.fit import fit_tree
 from dln_jax.learning.kinematics.frames import KinematicPrior, kinematic_prior_from_json
 from dln_jax.learning.kinematics.search import Search
-from dln_jax.learning.settings import Arm, LearnedTree
 from dln_jax.mechanics.friction.laws import USUAL
 from dln_jax.scale.devices import device_lines
 from dln_jax.types import InputError, Needs
