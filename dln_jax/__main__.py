@@ -11,16 +11,17 @@ from pathlib import Path
 from dln_jax.commands import COMMANDS
 
 
-def command(name: str, prog: str) -> None:
+def command(name: str, prog: str = "") -> None:
     """Runs one command with the arguments of this process.
 
     Args:
         name: name of a module in `dln_jax.commands`.
-        prog: the command as the user typed it, for help and messages.
+        prog: the command as the user typed it, for help and messages (default: that of a checkout).
     """
     # Factorisations here are small, and OpenBLAS's threads spin while they wait: a step of 560 tetrahedra took 4 to 20
     # times the processor time of one thread. OpenBLAS reads the variable when SciPy is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    prog = prog or f"python -m scripts.{name}"
     sys.argv[0] = prog  # reports state the command that made them
     try:
         from dln_jax.runs.running import run

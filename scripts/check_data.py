@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("check_data", "python -m scripts.check_data")
+command("check_data")

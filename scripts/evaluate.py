@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("evaluate", "python -m scripts.evaluate")
+command("evaluate")

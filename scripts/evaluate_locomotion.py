@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("evaluate_locomotion", "python -m scripts.evaluate_locomotion")
+command("evaluate_locomotion")

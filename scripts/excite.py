@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("excite", "python -m scripts.excite")
+command("excite")

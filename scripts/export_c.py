@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("export_c", "python -m scripts.export_c")
+command("export_c")

@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("identify", "python -m scripts.identify")
+command("identify")

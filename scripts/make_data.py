@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("make_data", "python -m scripts.make_data")
+command("make_data")

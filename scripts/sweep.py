@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("sweep", "python -m scripts.sweep")
+command("sweep")

@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("train_delan", "python -m scripts.train_delan")
+command("train_delan")

@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("train_diffnet", "python -m scripts.train_diffnet")
+command("train_diffnet")

@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("train_hnn", "python -m scripts.train_hnn")
+command("train_hnn")

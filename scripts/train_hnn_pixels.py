@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("train_hnn_pixels", "python -m scripts.train_hnn_pixels")
+command("train_hnn_pixels")

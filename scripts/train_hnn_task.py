@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("train_hnn_task", "python -m scripts.train_hnn_task")
+command("train_hnn_task")

@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("train_locomotion", "python -m scripts.train_locomotion")
+command("train_locomotion")

@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("train_value", "python -m scripts.train_value")
+command("train_value")

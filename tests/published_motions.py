@@ -4,7 +4,7 @@ Greydanus, Dzamba and Yosinski (2019). Keys are those of the schema; q and p car
 exact at the noiseless states, and bodies are ordered axis by axis: x1, x2, .., y1, y2, .. as in the published arrays.
 
 `python -m tests.published_motions FOLDER` writes TASK-SEED.npz files of three seeds, which
-`python -m scripts.hnn_table --own FOLDER` reads.
+`python -m scripts.report hnn --own FOLDER` reads.
 """
 
 import sys

@@ -65,9 +65,7 @@ def script_and_arguments(words):
 
 def cases_and_line(words):
     """The cases of a report, and the words after its name, of which a first one without dashes is a subject."""
-    source = (ROOT / "scripts" / f"{words[2].removeprefix('scripts.')}.py").read_text()
-    called = re.search(r'^report\("(\w+)"', source, re.MULTILINE)
-    name, line = (called[1], words[3:]) if called else (words[3], words[4:])
+    name, line = words[3], words[4:]
     subject = ["--only"] if line and not line[0].startswith("-") else []
     return importlib.import_module(f"scripts.reports.cases.{name}").CASES, [*subject, *line]
 

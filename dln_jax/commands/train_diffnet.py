@@ -2,7 +2,7 @@
 
 Functions: sin (1-D), cos_sin (cos x1 sin x2), both with the published noise, or your own npz file with x [N, n],
 y [N, m] and optional dy, d2y. A run folder gets config.json, metrics.json, model.safetensors and model.json (load them
-with dln_jax.load), and figures. For the published table of activations and losses see diffnet_table.
+with dln_jax.load), and figures. `python -m scripts.report diffnet table` has the published activations and losses.
 """
 
 from dataclasses import dataclass

@@ -49,8 +49,8 @@ def train(
         seconds: time limit of the fit.
         uncertainty: estimate the uncertainty of the torques.
         say: takes lines on the progress, such as `print`.
-        settings: fields of the model's class in `learning.fits.settings`, such as `width`. The `optimizer` of a network may
-            be any of optax: `optimizer=optax.adam(3e-4), steps=5000`.
+        settings: fields of the class of the model in `learning.fits.settings`, such as `width`. The `optimizer` of a
+            network may be any of optax: `optimizer=optax.adam(3e-4), steps=5000`.
 
     Raises:
         InputError: JAX without float64, an unknown model or setting, or data that the model cannot be fitted to.

@@ -37,15 +37,9 @@ UNITS = {
     "per_second": "1/s",
     "m": "m",
     "bytes": "B",
-    "hz": "Hz",
-    "joules": "J",
-    "j": "J",
-    "newtons": "N",
-    "nm": "N m",
     "metres": "m",
     "mm": "mm",
     "torque_mse": "N^2 m^2",
-    "percent": "%",
     "mib": "MiB",
 }
 """Units by the words in a quantity's name; all others are numbers without a unit."""
@@ -85,28 +79,19 @@ class Case(NamedTuple):
     """Whether the case is measured only if --only names it, such as one that needs other simulators."""
 
 
-def report(name: str, *usual: str) -> None:
-    """Runs the command line of a report: the words that the user typed.
-
-    Args:
-        name: module of `scripts.reports.cases`.
-        usual: subjects that are measured unless --only names others. A first word without dashes is such a subject.
-    """
+def report(name: str) -> None:
+    """Runs the command line of a report, a module of `scripts.reports.cases`; a first word without dashes is --only."""
     # Factorisations here are small, and OpenBLAS's threads wait for each other by spinning.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     words = sys.argv[1:]
     if words and not words[0].startswith("-"):
         words.insert(0, "--only")
-    elif usual and not any(word.startswith("--only") for word in words):
-        words += ["--only", ",".join(usual)]
     module = importlib.import_module(f"scripts.reports.cases.{name}")
-    command = Path(sys.argv[0]).stem
-    prog = f"python -m scripts.{f'report {name}' if command == 'report' else command}"
-    sys.argv[0] = prog  # reports state the command that made them
+    sys.argv[0] = f"python -m scripts.report {name}"  # reports state the command that made them
     run(
         lambda options: measure_report(name, module.CASES, options),
         arguments_of(module.CASES),
-        prog=prog,
+        prog=sys.argv[0],
         line=words,
         description=module.__doc__,
         from_shell=True,

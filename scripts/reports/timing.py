@@ -83,4 +83,4 @@ def casadi():
 
 def last_line(output: bytes) -> str:
     """The last line of a process's output."""
-    return next(iter(reversed(output.decode(errors="replace").strip().splitlines())), "it printed nothing")
+    return (output.decode(errors="replace").strip().splitlines() or ["it printed nothing"])[-1]

@@ -1,4 +1,4 @@
-"""Hamiltonian tasks: hnn_table and train_hnn_task end to end on tiny budgets, and what they refuse."""
+"""Hamiltonian tasks: the report hnn and train_hnn_task end to end on tiny budgets, and what they refuse."""
 
 import numpy as np
 import pytest

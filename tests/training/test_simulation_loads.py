@@ -42,7 +42,7 @@ def test_a_scene_that_holds_nothing_says_that_it_does_not_use_the_held_vertices_
 def test_a_mistake_is_one_line(path):
     for option, value, message in (
         ("pressure", "bag=2", "--mesh the mesh has no set 'bag'"),
-        ("pressure", "inner", "--pressure has 'inner', expected NAME=VALUE"),
+        ("pressure", "inner", "--pressure has 'inner'; expected NAME=VALUE"),
         ("pressure", "inner=1,inner=2", "--pressure names 'inner' twice"),
         ("load", "tip=1,2,3", "--load tip is '1,2,3'; expected 2 numbers"),
         ("load", "tip=1,2; tip=3,4", "--load names 'tip' twice"),

@@ -1,3 +1,0 @@
-from scripts.reports.run import report
-
-report("arm", "published", "letters", "speeds")

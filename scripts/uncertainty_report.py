@@ -1,3 +1,0 @@
-from scripts.reports.run import report
-
-report("uncertainty")
