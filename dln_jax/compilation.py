@@ -1,15 +1,11 @@
-"""Compilation: XLA options for programs that run for seconds on a CPU, and a thread that compiles programs."""
+"""Compilation: XLA options for programs that run for seconds on a CPU."""
 
 import functools
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import jax
 
 _OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
-Result = TypeVar("Result")
-Arguments = ParamSpec("Arguments")
 
 
 def quick_compilation() -> dict[str, Any]:
@@ -35,17 +31,3 @@ def _known() -> dict[str, Any]:
         else:
             known[name] = value
     return known
-
-
-def in_background(
-    function: Callable[Arguments, Result], *arguments: Arguments.args, **options: Arguments.kwargs
-) -> Callable[[], Result]:
-    """Starts `function(*arguments, **options)` in a thread; XLA lets go of the interpreter while it compiles or runs.
-
-    Returns:
-        A function that waits for the result and returns it, or raises the exception of `function`.
-    """
-    thread = ThreadPoolExecutor(1)
-    future = thread.submit(function, *arguments, **options)
-    thread.shutdown(wait=False)
-    return future.result

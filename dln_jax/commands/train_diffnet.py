@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from dln_jax.errors import InputError
-from dln_jax.runs.arguments import Unstated, choice, refuse_given, resolved
+from dln_jax.options import Unstated, choice
+from dln_jax.runs.arguments import refuse_given, resolved
 from dln_jax.runs.options import Drawn, Resumable, Scaled
 
 NAMES = ("sin", "cos_sin")

@@ -12,10 +12,8 @@ from tyro._errors import BadValue, InstantiationFailure, InvalidChoice, ParseErr
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from dln_jax.errors import InputError
-from dln_jax.options import Unstated, choice  # noqa: F401  moved
 from dln_jax.sizes import require_magnitude
 
-T = TypeVar("T")
 Arguments = TypeVar("Arguments")
 
 _rules = ConstructorRegistry()

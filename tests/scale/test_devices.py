@@ -9,7 +9,6 @@ import pytest
 
 from dln_jax import compilation
 from dln_jax.export.low_latency import enable_low_latency, low_latency
-from dln_jax.learning.engine.problem import Problem, require_finite_start
 from dln_jax.runs.options import Scaled
 from dln_jax.runs.running import run
 from dln_jax.scale import devices
@@ -25,11 +24,6 @@ def on_gpu(monkeypatch):
 def test_no_options_of_the_cpu_reach_another_compiler(on_gpu, monkeypatch):
     monkeypatch.setattr(compilation, "_OPTIONS", {"xla_backend_optimization_level": 1})
     assert compilation.quick_compilation() == {}
-    calls, compiled = [], jax.jit
-    monkeypatch.setattr(jax, "jit", lambda f, **options: calls.append(options) or compiled(f))
-    problem = Problem(lambda w, x: w * x, jnp.ones(1), (jnp.ones((2, 1)),), lambda w: (w[0], w[0]))
-    require_finite_start(problem, problem.arrays)
-    assert [options.get("compiler_options") for options in calls] == [None]
 
 
 def test_low_latency_mode_is_refused_with_the_reason(on_gpu):

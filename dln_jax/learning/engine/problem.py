@@ -94,14 +94,6 @@ def unmonitored(value: Scalar) -> tuple[Scalar, Scalar]:
     return value, jnp.full_like(value, jnp.nan)
 
 
-def require_finite_start(problem: Problem, arrays: tuple[Any, ...]) -> None:
-    """Raises `InputError` unless the initial loss on these arrays (of the first seed) is finite; compiles the loss."""
-    parameters = jax.tree.map(lambda leaf: leaf[0], problem.parameters) if problem.several else problem.parameters
-    options = {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else None
-    if not np.isfinite(jax.jit(loss_of(problem), compiler_options=options)(parameters, arrays)):
-        raise InputError(NO_START)
-
-
 class Best(NamedTuple):
     """Parameters with the lowest score so far. Several seeds add a leading axis."""
 
