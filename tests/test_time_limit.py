@@ -53,7 +53,7 @@ def test_growing_networks_share_one_limit(arm, clock, monkeypatch):
     """Each takes 20 s: the second ends beyond 30 s, and no third is begun."""
     left = []
 
-    def trained(plan, sets, context, **_):
+    def train_plan(plan, sets, context, **_):
         left.append(context.seconds)
         clock.time += 20.0
         return training(1.0 / len(left))
@@ -61,7 +61,7 @@ def test_growing_networks_share_one_limit(arm, clock, monkeypatch):
     def ended(*_):
         raise Enough
 
-    monkeypatch.setattr(network, "trained", trained)
+    monkeypatch.setattr(network, "train_plan", train_plan)
     monkeypatch.setattr(network, "latency_of", lambda *_, **__: SimpleNamespace(p50_us=1.0))
     monkeypatch.setattr(network, "say_selection", ended)
     with pytest.raises(Enough):

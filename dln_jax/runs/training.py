@@ -66,7 +66,7 @@ def train(
         raise InputError(f"{model} has no setting {unknown[0]!r:.60}; expected some of {', '.join(known)}")
     if "optimizer" in settings and not isinstance(settings["optimizer"], str):
         settings |= {"optimizer": "adam", "rule": settings["optimizer"]}
-    log = logged(log)
+    log = as_log(log)
     parts = split_log(log, test, seed=seed)
     until = math.inf if seconds is None else deadline(seconds)
     fit = way(**{"model": model, **settings}).fit(log, parts, Context(seed, until, say))
@@ -97,7 +97,7 @@ def identify(
     Raises:
         InputError: JAX without float64, or a log that does not belong to the robot.
     """
-    from dln_jax.learning.fits.automatic import identified
+    from dln_jax.learning.fits.automatic import identify_robot
     from dln_jax.runs.evaluation import evaluate as evaluate_fit
 
     require_double_precision("identify")
@@ -108,7 +108,7 @@ def identify(
         raise InputError(f"{log.name} has other joints than the robot; read it by read_log(..., robot=...)")
     log = log._replace(robot=log.robot or robot)
     parts = split_log(log, test)
-    fit = with_uncertainty(identified(log, parts), parts, log.torque, say)
+    fit = with_uncertainty(identify_robot(log, parts), parts, log.torque, say)
     return dataclasses.replace(fit, report=evaluate_fit(fit, parts, log, say=say))
 
 
@@ -121,7 +121,7 @@ def evaluate(run: Run | str | Path, log: Log | Trajectories | str | Path) -> "Re
     from dln_jax.runs.evaluation import evaluate as evaluate_fit
 
     run = load(run) if isinstance(run, str | Path) else run
-    needs, log = needs_from_json(run.description["needs"]), logged(log)
+    needs, log = needs_from_json(run.description["needs"]), as_log(log)
     if needs.joints != log.needs.joints:
         raise InputError(
             f"the model has the joints {'-'.join(needs.joints)}, {log.name} has {'-'.join(log.needs.joints)}; "
@@ -133,7 +133,7 @@ def evaluate(run: Run | str | Path, log: Log | Trajectories | str | Path) -> "Re
     return evaluate_fit(fit, Parts(Split(log.data, empty, log.data)), log)
 
 
-def logged(log: Log | Trajectories | str | Path) -> Log:
+def as_log(log: Log | Trajectories | str | Path) -> Log:
     """The log of a file or of trajectories; a log itself."""
     if isinstance(log, Log):
         return log

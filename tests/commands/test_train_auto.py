@@ -64,7 +64,7 @@ def test_finished_candidates_are_stored_and_not_fitted_again(workplace, tmp_path
         chosen(tmp_path)
     kept = load(tmp_path / "candidates/rigid-tree")
 
-    monkeypatch.setattr(automatic, "identified", interrupted)
+    monkeypatch.setattr(automatic, "identify_robot", interrupted)
     for name in names:
         monkeypatch.setattr(automatic, name, lambda **_: SimpleNamespace(fit=lambda *_: "not in this test"))
     monkeypatch.setattr(automatic, "with_network", lambda *_: "not in this test")

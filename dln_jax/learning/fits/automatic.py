@@ -73,7 +73,7 @@ def fit(settings: Automatic, log: Log, parts: Parts, context: Context) -> Fit:
     context = context if limited else context.within(SELECTION_SECONDS)
 
     def bound(name: str, candidate: Candidate) -> Callable[[], Fit | str]:
-        return lambda: stored(name, candidate, parts, context if limited else context.within(CANDIDATE_SECONDS))
+        return lambda: fit_or_load(name, candidate, parts, context if limited else context.within(CANDIDATE_SECONDS))
 
     def beside(base: Fit) -> tuple[str, Callable[[], Fit | str]] | None:
         if not (base.properties.linear or base.properties.searched):
@@ -187,7 +187,7 @@ def candidates_of(settings: Automatic, log: Log, parts: Parts) -> dict[str, Cand
     """The candidates by name, from the strongest prior knowledge to the weakest."""
     known: dict[str, Candidate] = {}
     if log.robot is not None:
-        known["rigid-tree"] = lambda context: identified(log, parts)
+        known["rigid-tree"] = lambda context: identify_robot(log, parts)
     arm = LearnedTree(parents=settings.parents, kinematic_prior=settings.kinematic_prior)
     learned: dict[str, Candidate] = {"learned-tree": lambda context: arm.fit(log, parts, context)}
     first, second = (parameters_of_degree(log.needs, degree) for degree in (1, 2))
@@ -206,7 +206,7 @@ def candidates_of(settings: Automatic, log: Log, parts: Parts) -> dict[str, Cand
     return known | (explicit | learned if small else learned | explicit | kernel) | network
 
 
-def stored(name: str, candidate: Candidate, parts: Parts, context: Context) -> Fit | str:
+def fit_or_load(name: str, candidate: Candidate, parts: Parts, context: Context) -> Fit | str:
     """Fits a candidate and stores it in a folder of its own, or takes it from there if the run is resumed.
 
     A learned tree is fitted again: its verdict needs the search.
@@ -252,7 +252,7 @@ def is_definite(result: Fit, parts: Parts) -> bool:
         return definiteness(mechanics, data.q, data.qd).share_not_definite == 0
 
 
-def identified(log: Log, parts: Parts) -> Fit:
+def identify_robot(log: Log, parts: Parts) -> Fit:
     """Identifies the bodies and the friction of the robot's tree."""
     if log.robot is None:
         raise InputError("the log names no robot, whose tree could be identified; give its file as robot=")
@@ -273,7 +273,7 @@ def with_network(base: Fit, log: Log, parts: Parts, context: Context) -> Fit | s
     would fit them.
     """
     began, train = time.perf_counter(), parts.sets.train
-    base = as_rigid(base, log, parts) if base.properties.searched else base
+    base = rigid_tree_of(base, log, parts) if base.properties.searched else base
     fitted, chosen_by = inner_split(train)
     added = fit_residual(
         base.model,
@@ -290,7 +290,7 @@ def with_network(base: Fit, log: Log, parts: Parts, context: Context) -> Fit | s
     return direct(description, base.needs, parts, added.parameters, time.perf_counter() - began)
 
 
-def as_rigid(learned: Fit, log: Log, parts: Parts) -> Fit:
+def rigid_tree_of(learned: Fit, log: Log, parts: Parts) -> Fit:
     """A learned tree as a rigid tree with the same frames, bodies and friction."""
     needs, stated, solution = needs_of_tree(log.needs), learned.description, learned.parameters
     tree = tree_of(solution, needs, parents=stated["parents"], acceleration=stated["acceleration"])

@@ -61,14 +61,14 @@ def fit_basis(settings: Trigonometric, log: Log, parts: Parts, context: Context)
         solution = chosen.outcome
     else:
         solution = fit_linear(build(description), sets.train)
-    description, needs, solution = with_needed_offset(
+    description, needs, solution = choose_offset(
         description, log.needs, sets, solution, lambda lean: fit_linear(build(lean), sets.train), say
     )
     size = f"{solution.parameter_count} parameters, rank {solution.rank}, condition {solution.condition:.3g}"
     say(f"least squares: {size}")
-    loss, seconds = solution.torque_mse, time.perf_counter() - began
-    return refined(direct_fit(description, needs, parts, solution.parameters, goal_of(settings, sets), loss=loss,
-                              seconds=seconds), parts, context)  # fmt: skip
+    how = {"loss": solution.torque_mse, "seconds": time.perf_counter() - began}
+    start = direct_fit(description, needs, parts, solution.parameters, goal_of(settings, sets), **how)
+    return refine(start, parts, context)
 
 
 def _degrees(degrees: tuple[int, ...]) -> str:
@@ -87,7 +87,7 @@ def fit_energies(settings: Kernel, log: Log, parts: Parts, context: Context) -> 
     description = describe_for(
         settings.model, sets.train, log.needs, precision=settings.precision or "f64", samples=count, serial=order
     )
-    description, needs, solution = with_needed_offset(
+    description, needs, solution = choose_offset(
         description,
         log.needs,
         sets,
@@ -116,7 +116,7 @@ def goal_of(settings: Goal, sets: Split) -> Objective:
     return SCALED_TORQUE if objective is TORQUE else objective
 
 
-def with_needed_offset(
+def choose_offset(
     description: Description,
     needs: Needs,
     sets: Split,
@@ -146,7 +146,7 @@ def with_needed_offset(
     return chosen.outcome
 
 
-def refined(start: Fit, parts: Parts, context: Context) -> Fit:
+def refine(start: Fit, parts: Parts, context: Context) -> Fit:
     """Refines a direct fit by Gauss-Newton unless its objective is that of torques; keeps what validation prefers.
 
     Raises:

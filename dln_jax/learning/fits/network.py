@@ -58,7 +58,7 @@ def fit(settings: Network, log: Log, parts: Parts, context: Context) -> Fit:
     Raises:
         InputError: settings out of range, data that cannot determine the model, or a loss that is not finite.
     """
-    plan = planned(settings, log, parts, context.seed)
+    plan = plan_network(settings, log, parts, context.seed)
     say = context.say
     if plan.needs != log.needs:
         say("friction has no offset: the potential takes any constant")
@@ -69,27 +69,27 @@ def fit(settings: Network, log: Log, parts: Parts, context: Context) -> Fit:
     for line in device_lines(plan.description["precision"]):
         say(line)
     if settings.target is not None:
-        return grown(settings.target, plan, parts, context)
+        return grow(settings.target, plan, parts, context)
     several = settings.seeds > 1 and settings.folds > 1
     seconds = context.seconds / (settings.folds + 1 if several else 1)
-    training = trained(plan, parts.sets, context.within(seconds), shown=True)
+    training = train_plan(plan, parts.sets, context.within(seconds), shown=True)
     if training.stop.reason != "not finite" and not np.isfinite(training.validation).any():
         raise InputError("no validation error is finite; there is no model: look for large numbers in the data")
     best = int(np.argmin(np.nan_to_num(np.ravel(training.validation), nan=np.inf)))
     if several:
-        best = cross_validated(plan, parts.sets, context, settings.folds)
+        best = cross_validate(plan, parts.sets, context, settings.folds)
         if not np.isfinite(training.validation[best]):
             best = int(np.argmin(np.nan_to_num(training.validation, nan=np.inf)))
-    return fitted(plan, training, best, cross_validated=several)
+    return fit_of_plan(plan, training, best, cross_validated=several)
 
 
-def fitted(plan: Plan, training: Training, best: int, **how: Any) -> Fit:
+def fit_of_plan(plan: Plan, training: Training, best: int, **how: Any) -> Fit:
     """The fit of a trained plan."""
     how |= {"objective": plan.objective, "optimiser": plan.optimiser, "seeds": plan.seeds}
     return fit_of(plan.description, plan.needs, training, best, **how)
 
 
-def planned(settings: Network, log: Log, parts: Parts, seed: int) -> Plan:
+def plan_network(settings: Network, log: Log, parts: Parts, seed: int) -> Plan:
     """Plans the network and its optimiser: as stated, or as the sizes of model and data suggest."""
     require_consistent(settings, seed)
     name, sets, needs, optimizer = settings.model, parts.sets, log.needs, settings.optimizer
@@ -159,7 +159,7 @@ def problem_of(plan: Plan, sets: Split) -> Problem:
     )
 
 
-def trained(plan: Plan, sets: Split, context: Context, *, name: str = "checkpoint", shown: bool = False) -> Training:
+def train_plan(plan: Plan, sets: Split, context: Context, *, name: str = "checkpoint", shown: bool = False) -> Training:
     """Trains the plan on these sets in the time of the context."""
     total = plan.optimiser.steps
     identity = dynamics.identity_of(plan.optimiser, sets, plan.objective, seeds=plan.seeds)
@@ -174,7 +174,7 @@ def trained(plan: Plan, sets: Split, context: Context, *, name: str = "checkpoin
         )
 
 
-def cross_validated(plan: Plan, sets: Split, context: Context, folds: int) -> int:
+def cross_validate(plan: Plan, sets: Split, context: Context, folds: int) -> int:
     """Index of the seed with the lowest cross-validation error over folds of the motions.
 
     One or two validation motions often prefer the worse of two seeds. Every motion outside the test is in one fold.
@@ -186,7 +186,7 @@ def cross_validated(plan: Plan, sets: Split, context: Context, folds: int) -> in
     for number, held in enumerate(np.array_split(motions, folds)):
         fold = Split(trajectories(rest, np.setdiff1d(motions, held)), trajectories(rest, held), sets.test)
         own = context.within(context.seconds / (folds - number))
-        training = trained(plan, fold, own, name=f"checkpoint_fold_{number + 1}")
+        training = train_plan(plan, fold, own, name=f"checkpoint_fold_{number + 1}")
         total += np.asarray(training.validation) * len(fold.validation.t)
     errors = total / len(rest.t)
     text = ", ".join(f"{seed}: {error:.2e}" for seed, error in zip(np.ravel(plan.seeds), errors, strict=True))
@@ -194,7 +194,7 @@ def cross_validated(plan: Plan, sets: Split, context: Context, folds: int) -> in
     return int(np.argmin(np.nan_to_num(errors, nan=np.inf)))
 
 
-def grown(target: float, plan: Plan, parts: Parts, context: Context) -> Fit:
+def grow(target: float, plan: Plan, parts: Parts, context: Context) -> Fit:
     """Trains all networks of a width before the next width, up to the first width that meets the target.
 
     Keeps the fastest network that meets it or, if none does, the most accurate.
@@ -215,19 +215,21 @@ def grown(target: float, plan: Plan, parts: Parts, context: Context) -> Fit:
         networks = 1 if size["shared_trunk"] else 2
         own = plan._replace(description={**plan.description, **size})
         name = f"checkpoint_{size['width']}x{size['depth']}_{networks}"
-        result = fitted(own, trained(own, parts.sets, context, name=name), 0)
+        result = fit_of_plan(own, train_plan(own, parts.sets, context, name=name), 0)
         error = float(result.training.validation)
         # The selection depends on the time, so all processes must use the same value.
         speed = of_first_process(latency_of(result, parts.sets.test, calls=2000).p50_us, context.mesh)
         words = f"{size['depth']} x {size['width']}, {'one network' if networks == 1 else 'two networks'}"
         context.say(f"{words}: validation {error:.2e}, target {'met' if error <= target else 'not met'}")
-        rows.append({
-            "name": words,
-            "parameters": sum(np.size(leaf) for leaf in jax.tree.leaves(result.parameters)),
-            "validation_error": error,
-            "train_seconds": result.training.train_seconds + result.training.compile_seconds,
-            "one_step_us": speed,
-        })  # fmt: skip
+        rows.append(
+            {
+                "name": words,
+                "parameters": sum(np.size(leaf) for leaf in jax.tree.leaves(result.parameters)),
+                "validation_error": error,
+                "train_seconds": result.training.train_seconds + result.training.compile_seconds,
+                "one_step_us": speed,
+            }
+        )
         speeds[words] = speed
         trial = Trial(size, (result, words), np.array([error]))
         met.extend([trial] * (error <= target))

@@ -5,7 +5,7 @@ from dln_jax.data.parts import Parts
 from dln_jax.files import read_json
 from dln_jax.learning.context import Context
 from dln_jax.learning.fit import Fit, direct_fit
-from dln_jax.learning.fits.direct import goal_of, refined
+from dln_jax.learning.fits.direct import goal_of, refine
 from dln_jax.learning.fits.settings import Arm, LearnedTree
 from dln_jax.learning.kinematics.fit import fit_tree
 from dln_jax.learning.kinematics.frames import KinematicPrior, kinematic_prior_from_json
@@ -46,7 +46,7 @@ def fit(settings: LearnedTree, log: Log, parts: Parts, context: Context) -> Fit:
     context.say(f"learned tree: {size}condition {solution.condition:.3g}")
     how = {"loss": solution.torque_mse, "seconds": solution.seconds, "search": solution}
     objective = goal_of(settings, parts.sets)
-    return refined(direct_fit(description, needs, parts, solution.parameters, objective, **how), parts, context)
+    return refine(direct_fit(description, needs, parts, solution.parameters, objective, **how), parts, context)
 
 
 def needs_of_tree(needs: Needs) -> Needs:
