@@ -27,6 +27,7 @@ from dln_jax.learning.selection import say_selection
 from dln_jax.scale.devices import device_lines
 from dln_jax.scale.mesh import of_first_process
 from dln_jax.sizes import require_network
+from dln_jax.time_limit import SOON
 from dln_jax.types import InputError, Needs, require_positive, require_seed
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import Description, build, describe_for
@@ -204,9 +205,16 @@ def grow(target: float, plan: Plan, parts: Parts, context: Context) -> Fit:
     rows: list[dict[str, Any]] = []
     kinds = list(itertools.product(DEPTHS, (True, False) if plan.needs.gravity else (False,)))
 
+    ended = ""
+
     def sizes() -> Iterator[dict[str, Any]]:
+        nonlocal ended
         for width in WIDTHS:
             for depth, shared in kinds:
+                # All processes have to agree.
+                if rows and of_first_process(context.seconds <= SOON, context.mesh):
+                    ended = f"out of time: networks of width {width} and more were not all tried"
+                    return
                 yield {"width": width, "depth": depth, "shared_trunk": shared}
             if met:
                 return
@@ -235,15 +243,11 @@ def grow(target: float, plan: Plan, parts: Parts, context: Context) -> Fit:
         met.extend([trial] * (error <= target))
         return trial.outcome, trial.errors  # type: ignore[return-value]
 
-    chosen, trials = select(
+    chosen, _ = select(
         sizes(),
         attempt,
         rule=lambda trials: min(met, key=lambda trial: speeds[trial.outcome[1]]) if met else lowest(trials),
-        until=context.until,
     )
-    ended = ""
-    if not met and len(trials) < len(WIDTHS) * len(kinds):
-        ended = "out of time: larger networks were not tried"
     say_selection(context, f"grown until the validation error is {target:g}", chosen.outcome[1], ended, rows)
     if not met:
         context.say(f"no candidate meets {target:g}; kept is the most accurate. More --steps or --seconds may help")
