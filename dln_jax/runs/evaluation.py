@@ -234,9 +234,9 @@ def verdict_of(
         numbers["share_not_definite"] = definite.share_not_definite
         numbers["largest_condition_number"] = definite.largest_condition_number
     if fit.search is not None:
-        of_search, found = verdict_on_search(fit.search, held["test"])
+        of_search, of_descents = verdict_on_search(fit.search, held["test"])
         verdicts += [] if of_search is None else [of_search]
-        numbers = found | numbers
+        numbers = of_descents | numbers
     verdict = worst(*verdicts, causes=log.faults)
     nmse = {f"{name}_nmse": float(np.mean(errors.error / errors.unit)) for name, errors in held.items()}
     return verdict, {**nmse, **verdict_metrics(held["test"], verdict), **numbers}

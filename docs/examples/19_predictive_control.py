@@ -6,7 +6,7 @@ A cart swings a pole up on a rail of one metre, holds it, and brings it up again
 of the next 1.2 seconds are improved in every sample, within the limits of the force and the ends of the rail; near it,
 a regulator acts.
 
-.. figure:: /predictive-gif
+.. figure:: /predictive-control.gif
    :alt: A cart-pole swings up between the ends of its rail, is hit twice and recovers; its plan is drawn ahead of it
 
    The film that this example writes. Pale poles and the dashed line are the plan that acts.
@@ -170,7 +170,7 @@ def between_walls(axis, q, trail):
 
 
 write_closed_loop_gif(
-    Path("predictive-gif"),
+    Path("predictive-control.gif"),
     between_walls,
     t,
     x[:, :2],

@@ -56,9 +56,9 @@ def table(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "scripts.reports.cases.stones", Module)
     monkeypatch.chdir(tmp_path)
 
-    def called(*words, usual=()):
+    def called(*words):
         monkeypatch.setattr(sys, "argv", ["report", *map(str, words)])
-        report("stones", *usual)
+        report("stones")
         return json_of(tmp_path / "runs/stones-1/report.json") if "--out" not in words else None
 
     return called, calls
@@ -89,7 +89,7 @@ def test_rows_stand_beside_published_numbers_and_bounds(table, capsys):
 
 def test_options_are_the_keywords_of_the_functions(table, tmp_path):
     table[0]("fall", "--quick", "--log", "stones.csv")
-    table[0]("--quick", "--drops", "7", "--out", tmp_path / "other", usual=("fall",))
+    table[0]("--quick", "--drops", "7", "--out", tmp_path / "other", "--only", "fall")
     assert table[1] == [(1, ("low",), Path("stones.csv")), (7, ("low",), None)]
 
 

@@ -156,8 +156,10 @@ def run(options: Arguments) -> None:
         if motions:
             for name, theta in {"vpt_seconds": solution.theta, "by_torques_vpt_seconds": by_torques}.items():
                 tried = parameters_of(theta, known)
-                each, times["predicted_seconds"] = prediction_times(model, tried, motions[1], spread_of(*motions))
-                times[name] = float(np.mean(each))
+                predicted_times, times["predicted_seconds"] = prediction_times(
+                    model, tried, motions[1], spread_of(*motions)
+                )
+                times[name] = float(np.mean(predicted_times))
             of_motions += motion_lines(options.by, by_motions, times)
         whole = False
         if by_motions is not None:
@@ -266,15 +268,15 @@ def stated_motors(options: Arguments, d: int) -> tuple[Rows | None, tuple[Pair, 
 
 def motion_lines(by: str, fit: MotionFit | None, times: dict[str, float]) -> list[str]:
     """Lines on the fit to motions, if there is one, and on predictions of held-out motions."""
-    told = (
+    line = (
         f"held-out motions: predicted for {times['vpt_seconds']:.3g} s of {times['predicted_seconds']:.3g} s, by "
         f"torques alone for {times['by_torques_vpt_seconds']:.3g} s (mean valid prediction time)"
     )
     if fit is None:
-        return [told]
+        return [line]
     lines = [
         f"by {by}: windows are off by {fit.after:.3g} of their noise (before: {fit.before:.3g}; {fit.rounds} rounds)",
-        told,
+        line,
         f"motions follow the logged torques by {1e3 * fit.delay:.1f} ms; the model has no delay",
     ]
     return lines if fit.converged else [*lines, "the fit to motions did not converge; record motions closer to the use"]

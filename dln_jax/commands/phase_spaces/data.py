@@ -354,9 +354,9 @@ def weights_of(data: Trajectories, noise: tuple[float, ...] | None) -> dict[str,
     surveyed = select_samples(data, np.concatenate([parts[index] for index in sorted(order[:count])]))
     keys = ("q", "p", "qd", "pd")
     size = spreads(data, *keys)
-    found = [smooth_locally(surveyed._replace(q=column(surveyed, key))) for key in keys]
-    deviation = np.concatenate([smooth.noise for smooth in found])
-    resolved = np.concatenate([smooth.resolved for smooth in found])
+    smoothed = [smooth_locally(surveyed._replace(q=column(surveyed, key))) for key in keys]
+    deviation = np.concatenate([smooth.noise for smooth in smoothed])
+    resolved = np.concatenate([smooth.resolved for smooth in smoothed])
     measured = np.repeat([key not in data.estimated for key in keys], d)
     of_states = np.arange(4 * d) < 2 * d
     least = np.where(of_states, FREE_OF_NOISE, LEAST_RATE_NOISE)

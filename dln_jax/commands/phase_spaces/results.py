@@ -169,13 +169,13 @@ def predicted_motions(log: PhaseLog, fit: PhaseFit) -> list[Motions]:
         return [Motions(true.t, q[None, rows], qd[None, rows]) for true, q, qd, rows in pairs]
     # All times are padded to one length, so that one program predicts all motions.
     longest = max(len(true.t) for true in log.truth)
-    found = []
+    predictions = []
     for true in log.truth:
         count = len(true.t)
         t = np.pad(true.t, (0, longest - count), mode="edge")
         moved = predict(model, parameters, true.q[:, 0], true.p[:, 0], t)
-        found.append(Motions(moved.t[:count], moved.q[:, :count], moved.p[:, :count]))
-    return found
+        predictions.append(Motions(moved.t[:count], moved.q[:, :count], moved.p[:, :count]))
+    return predictions
 
 
 def samples_fitted(log: PhaseLog, fit: PhaseFit) -> int:

@@ -179,8 +179,8 @@ def figures_of(
         taken = "taken by friction\nand by the time step" if rubs else "taken by the time step"
         if example.control is not None or example.held_path is not None:
             taken = None  # energy is fed in
-        found = motion_energies(example.scene, params, jnp.asarray(x), jnp.asarray(v), control)
-        write_figure(path, energies_against_time(t, found, taken=taken, title=title))
+        stored = motion_energies(example.scene, params, jnp.asarray(x), jnp.asarray(v), control)
+        write_figure(path, energies_against_time(t, stored, taken=taken, title=title))
 
     film = functools.partial(
         write_soft_body_gif,

@@ -101,10 +101,10 @@ def compare(
 
 def classes(rows: Iterable[dict[str, Any]], key: Callable[[dict[str, Any]], Any]) -> list[list[dict[str, Any]]]:
     """Rows with the same key, in the order of the rows."""
-    found: dict[Any, list[dict[str, Any]]] = {}
+    groups: dict[Any, list[dict[str, Any]]] = {}
     for row in rows:
-        found.setdefault(tuple(key(row)), []).append(row)
-    return list(found.values())
+        groups.setdefault(tuple(key(row)), []).append(row)
+    return list(groups.values())
 
 
 def problem_of(values: Mapping[str, str]) -> tuple[tuple[str, str], ...]:

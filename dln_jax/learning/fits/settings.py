@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Literal
 from dln_jax.options import InPython, Unstated
 
 if TYPE_CHECKING:
-    from dln_jax.data.log import Log
-    from dln_jax.data.parts import Parts
-    from dln_jax.learning.context import Context
+    import dln_jax.data.log
+    import dln_jax.data.parts
+    import dln_jax.learning.context
     from dln_jax.learning.fit import Fit
 
 ActivationName = Literal["tanh", "softplus", "silu", "gelu", "sin", "cos"]
@@ -69,7 +69,12 @@ class Network(Goal):
     folds: InPython[int] = 3
     """Folds of the cross-validation over seeds (1: use the validation motions alone)."""
 
-    def fit(self, log: "Log", parts: "Parts", context: "Context") -> "Fit":
+    def fit(
+        self,
+        log: "dln_jax.data.log.Log",
+        parts: "dln_jax.data.parts.Parts",
+        context: "dln_jax.learning.context.Context",
+    ) -> "Fit":
         """Trains the network."""
         from dln_jax.learning.fits.network import fit
 
@@ -84,7 +89,12 @@ class Trigonometric(Goal):
     degree: Unstated[int] = None
     """Degree of the polynomials in every joint (default: chosen for each joint by validation)."""
 
-    def fit(self, log: "Log", parts: "Parts", context: "Context") -> "Fit":
+    def fit(
+        self,
+        log: "dln_jax.data.log.Log",
+        parts: "dln_jax.data.parts.Parts",
+        context: "dln_jax.learning.context.Context",
+    ) -> "Fit":
         """Fits the basis by least squares."""
         from dln_jax.learning.fits.direct import fit_basis
 
@@ -101,7 +111,12 @@ class Kernel:
     precision: Unstated[Precision] = None
     """Floating-point type of the model (default: f64)."""
 
-    def fit(self, log: "Log", parts: "Parts", context: "Context") -> "Fit":
+    def fit(
+        self,
+        log: "dln_jax.data.log.Log",
+        parts: "dln_jax.data.parts.Parts",
+        context: "dln_jax.learning.context.Context",
+    ) -> "Fit":
         """Fits a Gaussian process of the energies."""
         from dln_jax.learning.fits.direct import fit_energies
 
@@ -125,7 +140,12 @@ class LearnedTree(Arm, Goal):
 
     model: str = "learned-tree"
 
-    def fit(self, log: "Log", parts: "Parts", context: "Context") -> "Fit":
+    def fit(
+        self,
+        log: "dln_jax.data.log.Log",
+        parts: "dln_jax.data.parts.Parts",
+        context: "dln_jax.learning.context.Context",
+    ) -> "Fit":
         """Searches the frames, and eliminates everything else."""
         from dln_jax.learning.fits.tree import fit
 
@@ -138,7 +158,12 @@ class Automatic(Arm):
 
     model: str = "auto"
 
-    def fit(self, log: "Log", parts: "Parts", context: "Context") -> "Fit":
+    def fit(
+        self,
+        log: "dln_jax.data.log.Log",
+        parts: "dln_jax.data.parts.Parts",
+        context: "dln_jax.learning.context.Context",
+    ) -> "Fit":
         """Fits a sequence of candidates and keeps one."""
         from dln_jax.learning.fits.automatic import fit
 
