@@ -71,7 +71,7 @@ def select(
     fit: Callable[[Any], tuple[Any, Float[np.ndarray, " N"] | None]],
     *,
     rule: Callable[[Sequence[Trial]], Trial] = simplest,
-    patience: float = math.inf,
+    patience: int | float = math.inf,
     until: float = math.inf,
     stop: Callable[[Trial], bool] = lambda trial: False,
 ) -> tuple[Trial, list[Trial]]:
