@@ -128,11 +128,11 @@ def make_image_model(
         }
 
     def coefficients(networks: Any, scale: float | Array) -> LatentPhase:
-        def encode(c: Float[Array, " 2C"]) -> tuple[Latent, Latent]:
+        def encode(c: Float[Array, " two_C"]) -> tuple[Latent, Latent]:
             z = encoder.apply(networks["encoder"], c.reshape(2, components) / scale)
             return z[0], z[1] - z[0]
 
-        def decode(q: Latent, p: Latent) -> Float[Array, " 2C"]:
+        def decode(q: Latent, p: Latent) -> Float[Array, " two_C"]:
             return (scale * decoder.apply(networks["decoder"], jnp.stack([q, q + p]))).ravel()
 
         return LatentPhase(encode, decode, flow(dynamics.energies(networks["field"]), degrees_of_freedom=1))
@@ -141,11 +141,11 @@ def make_image_model(
         mean, basis, scale = (parameters["components"][name] for name in ("mean", "basis", "scale"))
         inner = coefficients(parameters["parameters"], scale)
 
-        def encode(frames: Float[Array, " 2n"]) -> tuple[Latent, Latent]:
+        def encode(frames: Float[Array, " two_n"]) -> tuple[Latent, Latent]:
             (pair,) = vectors(2 * pixels, frames=frames)
             return inner.encode(((pair.reshape(2, pixels) - mean) @ basis.T).ravel())
 
-        def decode(q: Latent, p: Latent) -> Float[Array, " 2n"]:
+        def decode(q: Latent, p: Latent) -> Float[Array, " two_n"]:
             q, p = vectors(1, q=q, p=p)
             return (mean + inner.decode(q, p).reshape(2, components) @ basis).ravel()
 
