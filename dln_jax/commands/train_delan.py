@@ -158,12 +158,12 @@ def train(options: Options, command: str) -> None:
     from dln_jax.data.parts import split_log
     from dln_jax.learning.context import Context
     from dln_jax.learning.fit import with_uncertainty
+    from dln_jax.process import deadline
     from dln_jax.runs.evaluation import evaluate
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import finish
     from dln_jax.runs.scaled import mesh_of
     from dln_jax.runs.stored_arguments import command_folder
-    from dln_jax.time_limit import deadline
     from dln_jax.types import require_positive
 
     seconds = getattr(options, "seconds", None)

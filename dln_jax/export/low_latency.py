@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.mechanics.arguments import require_shape
-from dln_jax.scale.devices import backend_started
+from dln_jax.scale import backend_started
 from dln_jax.types import InputError
 
 _SETTING = "jax_cpu_enable_async_dispatch"

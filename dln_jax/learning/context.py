@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from jax.sharding import Mesh
 
 from dln_jax.learning.engine.checkpoint import CHECKPOINT, Checkpoint
-from dln_jax.time_limit import seconds_left
+from dln_jax.process import seconds_left
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from dln_jax.locomotion.learning import Goal, Learned, Record, compile_learner, 
 from dln_jax.locomotion.task import FALLEN, Walk, advance, beginning, judged, make_task
 from dln_jax.locomotion.value import Window, targets
 from dln_jax.locomotion.worlds import Variation
-from dln_jax.scale.mesh import AXIS
+from dln_jax.scale import AXIS
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import Creature, lattice
 

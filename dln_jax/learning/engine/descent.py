@@ -28,7 +28,7 @@ from dln_jax.learning.engine.problem import (
     loss_of,
     no_best,
 )
-from dln_jax.scale.mesh import first, mean, share, shares
+from dln_jax.scale import first, mean, share, shares
 
 
 class AdamState(NamedTuple):
