@@ -49,8 +49,8 @@ class Plant(Drawn, Resumable, Filtered):
     scene: Unstated[SceneName] = None
     """Textbook scene that states the needs, such as chain-3; sampled without data."""
     needs: Unstated[str] = None
-    """Joints and terms, such as '{"joints": ["revolute"], "friction": true}' (default: those of the scene or file, else
-    revolute joints, gravity and friction)."""
+    """Joints and terms, such as '{"joints": ["revolute"], "friction": true}' (default: the scene's or file's, else
+    revolute, gravity, friction)."""
     seed: int = 0
     """Seed of parameters, shuffling and validation."""
     uncertainty: bool = True
