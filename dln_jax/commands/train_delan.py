@@ -31,7 +31,7 @@ ModelName = Annotated[
         "auto",
     ],
     tyro.conf.arg(
-        help="Model to learn (default: auto for --data, structured-delan for the letters and scenes).",
+        help="Model to learn (default: auto with --data, else structured-delan).",
         help_behavior_hint="",
     ),
 ]
