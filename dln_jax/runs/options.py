@@ -76,8 +76,7 @@ class Logged:
     units: Unstated[Literal["si", "degrees"]] = None
     """CSV: units of columns whose titles state none."""
     joints: Unstated[str] = None
-    """Joints to keep, in this order, comma separated; LOG=NAME renames one (default: all; one prefix or ending may
-    differ from the robot's names)."""
+    """Joints to keep, in this order; LOG=NAME renames one (default: all, also with a prefix or ending)."""
     topics: Unstated[str] = None
     """ROS bag: topics of joint states, comma separated (default: the only one)."""
     torque_factor: Unstated[str] = None
