@@ -29,7 +29,7 @@ from dln_jax.export.c.jaxprs import repeated_calls, traced
 from dln_jax.export.c.lowering import program_of
 from dln_jax.export.c.templates import CASADI_ABOUT, CASADI_BUILD, NEEDED, about, cmake, demo, header, preamble
 from dln_jax.export.c.text import PRECISIONS, check_name, comment, kind_of
-from dln_jax.export.exports import described, write_exports
+from dln_jax.export.exports import write_exports
 from dln_jax.precision import computing_in
 from dln_jax.types import InputError, require_positive
 
@@ -137,7 +137,7 @@ def source_files(
     if (longest := max(map(len, files.values()))) > LENGTH:
         raise InputError(f"the source would take {longest / 1e6:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")
     encoded = {file_name: text.encode() for file_name, text in files.items()}
-    return {**encoded, f"{name}.json": described(description(name, precision, version, signatures), encoded)}
+    return {**encoded, f"{name}.json": description(name, precision, version, signatures, encoded)}
 
 
 def _precision(functions: Functions) -> str:
