@@ -25,7 +25,7 @@ _WITHOUT_EFFECT = frozenset((
     "accuracy", "algorithm", "use_magma", "sharding", "out_sharding", "unroll", "linear",
     "_split_transpose", "weak_type", "new_dtype", "dtype", "index_dtype", "preferred_element_type",
     "indices_are_sorted", "unique_indices", "is_stable", "sort_eigenvalues", "conjugate_a", "branches_platforms",
-    "ft_in", "ft_out", "num_consts", "num_carry",
+    "ft_in", "ft_out", "memory_space", "devices", "srcs", "copy_semantics", "num_consts", "num_carry",
 ))  # fmt: skip
 """Parameters that no value depends on: hints, promises, and types that the results have anyway."""
 _REFUSED = {
