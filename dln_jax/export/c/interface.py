@@ -80,7 +80,9 @@ def result_leaves(shapes: Any, taken: Sequence[Leaf]) -> list[Leaf]:
 
 
 def array_of(leaf: Any) -> Any:
-    """Returns an array, or a number as an array."""
+    """Returns an array, a number as an array, or zeros for a shape."""
+    if isinstance(leaf, jax.ShapeDtypeStruct):
+        return np.zeros(leaf.shape, leaf.dtype)
     return leaf if hasattr(leaf, "dtype") else np.asarray(leaf)
 
 

@@ -17,10 +17,14 @@ def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, 
     """Returns the closed jaxpr of a function, and the tree of its results.
 
     Raises:
-        InputError: the function has side effects, or integers beyond 64 bits.
+        InputError: the function has side effects, integers beyond 64 bits, or branches of Python on an argument.
     """
     try:
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
+    except jax.errors.ConcretizationTypeError as error:
+        raise InputError(
+            "the function needs the value of an argument in Python, such as for `if x > 0`; write jnp.where or lax.cond"
+        ) from error
     except OverflowError as error:
         raise InputError(f"a whole number is out of range ({error}); C has integers of up to 64 bits") from error
     if closed.effects:

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -259,3 +260,9 @@ def test_an_export_never_takes_the_place_of_a_runs_file(tmp_path):
         with pytest.raises(InputError, match="is the folder of a run"):
             write_exports(tmp_path, {name: b"{}"}, overwrite=True)
     assert contents(tmp_path) == before
+
+
+def test_results_keep_the_order_in_which_they_were_written_and_a_shape_is_an_example():
+    shape = jax.ShapeDtypeStruct((3,), np.float64)
+    files = source_files({"f": (lambda x: {"z": x[0], "a": {"y": x, "b": 2 * x}}, (shape,))}, name="m")
+    assert "void m_f(const double x[3], double z[1], double a_y[3], double a_b[3]);" in files["m.h"].decode()
