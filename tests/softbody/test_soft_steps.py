@@ -18,6 +18,7 @@ from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
 from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.integrators import BDF2, INTEGRATORS, MIDPOINT
 from dln_jax.softbody.mesh.mesh import make_mesh
+from dln_jax.softbody.mesh.placement import join, translate
 from dln_jax.softbody.mesh.quadratic import quadratic
 from dln_jax.softbody.mesh.shapes import beam, lattice
 from dln_jax.softbody.scene import make_scene, with_parameters
@@ -235,8 +236,7 @@ def test_a_contact_that_would_push_a_body_open_is_refused():
         body_contact(slotted, distance=5e-3, stiffness=1e4)
     body_contact(slotted, distance=2e-3, stiffness=1e4)
     # Two bodies may be as near as that: they rest on each other.
-    above = BAR.vertices + np.array([0.0, 0.103])
-    stacked = make_mesh(np.concatenate([BAR.vertices, above]), np.concatenate([BAR.elements, BAR.elements + N]))
+    stacked = join(BAR, translate(BAR, [0.0, 0.103]))
     body_contact(stacked, distance=5e-3, stiffness=1e4)
     with one_line("capacity"):
         body_contact(stacked, distance=5e-3, stiffness=1e4, capacity=0)

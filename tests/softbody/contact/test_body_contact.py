@@ -15,7 +15,8 @@ from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
 from dln_jax.softbody.contact.surface import areas, surface_of
 from dln_jax.softbody.integrators import AVERAGE_VECTOR_FIELD, MIDPOINT
 from dln_jax.softbody.mesh.intersections import count_overlaps, simplices_overlap
-from dln_jax.softbody.mesh.mesh import Mesh, boundary_vertices, make_mesh, vertices_where
+from dln_jax.softbody.mesh.mesh import Mesh, boundary_vertices, vertices_where
+from dln_jax.softbody.mesh.placement import join, translate
 from dln_jax.softbody.mesh.quadratic import quadratic
 from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.scene import make_scene, prepare_contacts
@@ -28,8 +29,7 @@ from dln_jax.solvers.elements.moving import lists_between, moving_gradient
 
 def joined(one: Mesh, other: Mesh, *offset: float) -> Mesh:
     """Two bodies, the other one moved."""
-    vertices = np.concatenate([one.vertices, other.vertices + np.array(offset)])
-    return make_mesh(vertices, np.concatenate([one.elements, other.elements + len(one.vertices)]))
+    return join(one, translate(other, offset))
 
 
 def blocks(*offset):
