@@ -17,7 +17,7 @@ from dln_jax.commands import train_locomotion
 from dln_jax.figures.soft_bodies import write_soft_body_gif
 from dln_jax.locomotion import gradient
 from dln_jax.locomotion.environment import CreatureEnvironment
-from dln_jax.locomotion.frames import axes_of, fitted_frame, vertex_frame
+from dln_jax.locomotion.frames import Frame, axes_of, fitted_frame
 from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
 from dln_jax.locomotion.learning import Goal, Learned, Record, compile_learner, learn, make_policy
 from dln_jax.locomotion.task import FALLEN, Walk, advance, beginning, judged, make_task
@@ -120,7 +120,8 @@ def test_observations_do_not_change_if_the_body_is_moved_or_turned(dimension):
     x = vertices + 0.1 * random.normal(size=vertices.shape)
     rotation, _ = np.linalg.qr(random.normal(size=(dimension, dimension)))
     rotation[:, 0] *= np.linalg.det(rotation)
-    for frame in (fitted_frame(vertices), vertex_frame(6, range(dimension))):
+    corners = np.eye(6)[:dimension]
+    for frame in (fitted_frame(vertices), Frame(corners[0], corners[1:] - corners[0])):
         axes = jax.jit(functools.partial(axes_of, frame))
         seen = [(at - frame.origin @ at) @ axes(at).T for at in (x, x @ rotation.T + 3.0)]
         np.testing.assert_allclose(seen[0], seen[1], atol=1e-12)

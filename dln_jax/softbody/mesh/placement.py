@@ -1,7 +1,5 @@
 """Several bodies in one mesh, and bodies moved to their places before the simulation."""
 
-from collections import defaultdict
-
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -20,27 +18,29 @@ def join(*meshes: Mesh, **bodies: Mesh) -> Mesh:
     Raises:
         InputError: there is no mesh, or some are planar and others in space, or linear and quadratic.
     """
-    parts = [*((None, mesh) for mesh in meshes), *bodies.items()]
-    if len({(mesh.dimension, mesh.midsides is None) for _, mesh in parts}) != 1:
+    for name, mesh in bodies.items():
+        whole = NamedSet(np.arange(len(mesh.vertices)), np.arange(len(mesh.elements)))
+        meshes += (mesh._replace(sets={**mesh.sets, name: whole}),)
+    if len({(mesh.dimension, mesh.midsides is None) for mesh in meshes}) != 1:
         raise InputError("the meshes differ in dimension or order of their elements, or there is none; join alike ones")
-    united: dict[str, list[NamedSet]] = defaultdict(list)
-    n = m = 0
-    elements, midsides = [], []
-    for name, mesh in parts:
-        vertices = np.arange(len(mesh.vertices))
-        own = {} if name is None else {name: NamedSet(vertices, np.arange(len(mesh.elements)))}
-        for key, part in [*mesh.sets.items(), *own.items()]:
-            united[key].append(NamedSet(part.vertices + n, part.elements + m))
-        elements.append(mesh.elements + n)
-        midsides.append(None if mesh.midsides is None else mesh.midsides + n)
-        n, m = n + len(vertices), m + len(mesh.elements)
-    sets = {key: NamedSet(*map(np.unique, map(np.concatenate, zip(*of, strict=True)))) for key, of in united.items()}
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)]).astype(np.int32)
+    sets: dict[str, NamedSet] = {}
+    elements = 0
+    for mesh, start in zip(meshes, starts, strict=False):
+        for name, (vertices, members) in mesh.sets.items():
+            before = sets.get(name, NamedSet(np.zeros(0, int), np.zeros(0, int)))
+            sets[name] = NamedSet(
+                np.append(before.vertices, vertices + start), np.append(before.elements, members + elements)
+            )
+        elements += len(mesh.elements)
+    nodes = np.concatenate([mesh.nodes + start for mesh, start in zip(meshes, starts, strict=False)])
+    corners = meshes[0].dimension + 1
     return Mesh(
-        np.concatenate([mesh.vertices for _, mesh in parts]),
-        np.concatenate(elements),
-        sum(mesh.turned for _, mesh in parts),
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        nodes[:, :corners],
+        sum(mesh.turned for mesh in meshes),
         sets,
-        None if midsides[0] is None else np.concatenate(midsides),
+        None if meshes[0].midsides is None else nodes[:, corners:],
     )
 
 
