@@ -42,61 +42,54 @@ def force_decomposition(
     `data` is the test set, `predicted` [N, d] by the keys of `PARTS`; the model's name sets the colour, and
     the legend adds a note to it.
     """
-    shown = np.unique(data.trajectory)[:MOST_MOTIONS]
-    samples = np.flatnonzero(np.isin(data.trajectory, shown))
+    samples = np.flatnonzero(np.isin(data.trajectory, np.unique(data.trajectory)[:MOST_MOTIONS]))
     trajectory, joints = data.trajectory[samples], min(data.degrees_of_freedom, MOST_JOINTS)
-    starts = np.flatnonzero(np.r_[True, np.diff(trajectory) != 0])
-    moving = len(samples) > 2 * len(shown)
-    x = _running_time(data.t[samples], starts) if moving else np.arange(len(samples), dtype=float)
-    truths = {key: truth[samples] for key in PARTS if (truth := getattr(data, key)) is not None}
-    errors = {key: predicted[key][samples] - truth for key, truth in truths.items()}
-    largest = max((float(np.abs(error[:, :joints]).max()) for error in errors.values()), default=0.0)
+    starts = np.flatnonzero(np.diff(trajectory, prepend=-1))
+    moving = len(samples) > 2 * len(starts)
+    x = np.arange(len(samples), dtype=float)
+    if moving:  # motions are joined at the median spacing of their samples
+        steps = np.diff(data.t[samples], prepend=data.t[samples[0]])
+        steps[starts[1:]] = np.median(np.delete(steps, starts))
+        x = np.cumsum(steps)
+    of_truth, of_model, of_errors = ("-", "--", "-") if moving else ("o", ".-", ".")
+    modelled = {key: predicted[key][samples, :joints] for key in PARTS}
+    truths = {key: truth[samples, :joints] for key in PARTS if (truth := getattr(data, key)) is not None}
+    errors = {key: modelled[key] - truth for key, truth in truths.items()}
+    largest = float(np.max(np.abs(list(errors.values())), initial=0.0))
     factor, prefix = style.prefixed(largest, "")
     rows = [(key, is_error) for key in PARTS for is_error in (False, True) if not is_error or key in errors]
     heights = [LOW if is_error else HIGH for _, is_error in rows]
     figure, axes = style.figure(len(rows), joints, height=sum(heights) + 0.9, sharex=True, height_ratios=heights)
     figure.get_layout_engine().set(h_pad=0.02, hspace=0.0)  # type: ignore[union-attr]
-    shade, dash, dot = style.colour(model), "--" if moving else "", "" if moving else "."
+    shade, units = style.colour(model), [style.unit_of(data, joint) for joint in range(joints)]
     for line, (key, is_error) in zip(axes, rows, strict=True):
         for joint, axis in enumerate(line):
             if is_error:
-                axis.plot(x, errors[key][:, joint] / factor, "-" if moving else ".", color=shade, linewidth=0.9)
+                axis.plot(x, errors[key][:, joint] / factor, of_errors, color=shade, linewidth=0.9)
                 axis.set_ylim(-1.15 * largest / factor, 1.15 * largest / factor)
             else:
                 if key in truths:
-                    look = {"color": "black", "linewidth": 2.0, "markersize": 4, "label": "truth"}
-                    axis.plot(x, truths[key][:, joint], "-" if moving else "o", **look)
-                axis.plot(
-                    x, predicted[key][samples, joint], dash, marker=dot, color=shade, linewidth=1.3, label=model + note
-                )
-                low, high = axis.get_ylim()
-                if high - low < ROUNDING * np.ptp(predicted["tau"][samples, joint]):  # a part that is zero
+                    truth = truths[key][:, joint]
+                    axis.plot(x, truth, of_truth, color="black", linewidth=2.0, markersize=4, label="truth")
+                axis.plot(x, modelled[key][:, joint], of_model, color=shade, linewidth=1.3, label=model + note)
+                if np.ptp(axis.get_ylim()) < ROUNDING * np.ptp(modelled["tau"][:, joint]):  # a part that is zero
                     axis.set_ylim(-1.0, 1.0)
             axis.margins(x=0.01)
             axis.tick_params(axis="x", bottom=line is axes[-1])
-            for start in starts[1:]:
-                axis.axvline((x[start - 1] + x[start]) / 2, color="0.75", linewidth=0.8, zorder=0)
-        unit = style.unit_of(data, 0)
-        line[0].set_ylabel(f"error,\n{prefix}{unit}" if is_error else f"{PARTS[key]},\n{unit}")
-    names = [str(data.label[index]) for index in trajectory[starts]]
+            style.separate(axis, (x[starts[1:] - 1] + x[starts[1:]]) / 2)
+        line[0].set_ylabel(f"error,\n{prefix}{units[0]}" if is_error else f"{PARTS[key]},\n{units[0]}")
     time = "time, s (test motions in turn)" if joints < 3 and len(starts) > 1 else "time, s"
     for joint, (top, bottom) in enumerate(zip(axes[0], axes[-1], strict=True)):
-        unit = style.unit_of(data, joint)
-        style.title(top, f"joint {joint + 1}" + (f" ({unit})" if unit != style.unit_of(data, 0) else ""), pad=16)
-        for start, end, name in zip(starts, [*starts[1:], len(x)], names, strict=True):
+        unit = "" if units[joint] == units[0] else f" ({units[joint]})"
+        style.title(top, f"joint {joint + 1}{unit}", pad=16)
+        for start, end in itertools.pairwise([*starts, len(x)]):
+            name = str(data.label[trajectory[start]])
             place, size = ((x[start] + x[end - 1]) / 2, 1.04), style.SMALL if len(name) < 4 else 6.5
             top.annotate(name, place, xycoords=("data", "axes fraction"), ha="center", fontsize=size, color="0.35")
         bottom.set_xlabel(time if moving else "test state")
     figure.align_ylabels(axes[:, 0])
     style.legend_beside(figure, axes[0, 0], columns=2)
     return figure
-
-
-def _running_time(t: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Returns a continuous time of motions, joined at the median spacing of their samples."""
-    steps = np.diff(t, prepend=t[0])
-    steps[starts[1:]] = np.median(np.delete(steps, starts))
-    return np.cumsum(steps)
 
 
 def torque_by_joint(
@@ -155,18 +148,17 @@ def torque_bands(
     within = np.maximum(np.quantile(bands, 0.98, axis=0), np.quantile(np.abs(error[shown]), 0.995, axis=0))
     # One unit for all joints, so that their errors can be compared.
     factor, prefix = style.prefixed(float(within[:d].max()), "")
-    starts = np.flatnonzero(np.diff(data.trajectory[shown])) + 0.5
+    breaks = np.flatnonzero(np.diff(data.trajectory[shown])) + 0.5
     for joint, axis in enumerate(axes):
         band, largest = bands[:, joint] / factor, 1.1 * within[joint] / factor
-        look = {"color": style.colour(model), "alpha": 0.25, "linewidth": 0}
-        axis.fill_between(shown, -band, band, **look, label="95 % band")
+        shade = style.colour(model)
+        axis.fill_between(shown, -band, band, color=shade, alpha=0.25, linewidth=0, label="95 % band")
         axis.plot(shown, error[shown, joint] / factor, color="black", linewidth=0.8, label="predicted minus measured")
         axis.set_ylim(-largest, largest)
         flagged = np.repeat(out_of_distribution[shown], 2)
         edges = (shown[:, None] + [-0.5, 0.5]).ravel()
         axis.fill_between(edges, -largest, largest, where=flagged, color="0.5", alpha=0.25, linewidth=0)
-        for start in starts:
-            axis.axvline(start, color="0.75", linewidth=0.8, zorder=0)
+        style.separate(axis, breaks)
         axis.set_ylabel(f"joint {joint + 1},\n{prefix}{style.unit_of(data, joint)}")
         axis.tick_params(axis="x", labelbottom=joint == d - 1)
         axis.margins(x=0.01)
