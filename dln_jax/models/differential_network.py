@@ -10,7 +10,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from dln_jax.mechanics.arguments import vectors
-from dln_jax.nn import differential_mlp, ensembles
+from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import Activation
 from dln_jax.nn.differential_mlp import Layers
 from dln_jax.sizes import require_network
@@ -60,4 +60,6 @@ def make_differential_network(
 
         return function
 
-    return FunctionModel(lambda key: ensembles.init(key, sizes, members=members, dtype=dtype), derivatives)
+    return FunctionModel(
+        lambda key: differential_mlp.init_ensemble(key, sizes, members=members, dtype=dtype), derivatives
+    )

@@ -20,7 +20,6 @@ positive, and for scales that are neither one number nor one per coordinate.
 import inspect
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -66,21 +65,6 @@ class Model(NamedTuple):
         shapes = ", ".join(f"{jax.tree_util.keystr(path)} {list(leaf.shape)}" for path, leaf in leaves)
         count = sum(math.prod(leaf.shape) for _, leaf in leaves)
         return f"Model of {count:,} parameters\n  {shapes:.100}"
-
-
-@dataclass(frozen=True, eq=False)
-class OfSize:
-    """An energy of vectors [size], which refuses other sizes."""
-
-    function: Callable[..., Any]
-    size: int
-
-    def __call__(self, *state: Array) -> Any:
-        """Returns the energy; raises `InputError` for vectors of another size."""
-        for vector in state:
-            if vector.shape != (self.size,):
-                require_shape("a state of this model", vector.shape, (self.size,))
-        return self.function(*state)
 
 
 def make_delan(
@@ -152,12 +136,16 @@ def model_of(
         return initialise, functions
 
     networks = hk.without_apply_rng(hk.multi_transform(build))
-    return Model(
-        init=lambda key: networks.init(key, jnp.asarray(np.arange(d), dtype)),
-        energies=lambda parameters: record(
-            **{name: OfSize(partial(function, parameters), d) for name, function in networks.apply.items()}
-        ),
-    )
+
+    def energies(parameters: Parameters) -> Any:
+        def checked(function: Callable[..., Any], *state: Array) -> Any:
+            for vector in state:
+                require_shape("a state of this model", vector.shape, (d,))
+            return function(parameters, *state)
+
+        return record(**{name: partial(checked, function) for name, function in networks.apply.items()})
+
+    return Model(lambda key: networks.init(key, jnp.asarray(np.arange(d), dtype)), energies)
 
 
 def linearised(

@@ -219,10 +219,8 @@ def make_serial_tree(
         return SerialTreeParameters(turns, 0.15 * positions, inertias, armature, none, none, none)
 
     def energies(parameters: SerialTreeParameters) -> RecursiveSystem:
-        dissipation = None
-        if needs.friction:
-            coefficients = parameters.viscous, parameters.coulomb, parameters.offset
-            dissipation = joint_dissipation(*coefficients, velocity_scale=velocity_scale)
+        coefficients = parameters.viscous, parameters.coulomb, parameters.offset
+        dissipation = joint_dissipation(*coefficients, velocity_scale=velocity_scale)
         return tree_system(tree_of(parameters, needs, parents=parents, acceleration=acceleration), dissipation)
 
     return Model(init, energies)

@@ -31,6 +31,8 @@ and the weight along the slide, in place of their other terms.
 """
 
 import functools
+import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -62,15 +64,6 @@ class TrigonometricParameters(NamedTuple):
     """Viscous friction [d], in N m s or N s/m."""
 
 
-class Basis(NamedTuple):
-    """The basis functions at one q."""
-
-    values: Array
-    """b [B]; the first is 1."""
-    slopes: Array
-    """db/dq [d, B]."""
-
-
 def make_trigonometric(
     needs: Needs,
     *,
@@ -94,17 +87,16 @@ def make_trigonometric(
     d = needs.degrees_of_freedom
     degrees = _per_joint("degree", degree, d)
     of_potential = degrees if potential_degree is None else _per_joint("potential_degree", potential_degree, d)
-    mass_basis = functools.partial(basis, needs.joints, degrees)
     spring_degrees = tuple(
         max(n, SPRING_DEGREE) if joint == "prismatic" else n
         for joint, n in zip(needs.joints, of_potential, strict=True)
     )
+    mass_basis = functools.partial(basis, needs.joints, degrees)
     potential_basis = functools.partial(basis, needs.joints, spring_degrees)
     rows, columns = np.tril_indices(d)
     # (i, j) and (j, i) of M read the same row of coefficients.
     entry = np.zeros((d, d), int)
     entry[rows, columns] = entry[columns, rows] = np.arange(len(rows))
-
     entries, functions = len(rows), _size(needs.joints, degrees)
     if entries * functions > MOST_COEFFICIENTS:
         raise InputError(
@@ -126,15 +118,15 @@ def make_trigonometric(
         coefficients, potential, friction = parameters.mass[entry], parameters.potential, parameters.friction
 
         def coriolis(q: Vector, qd: Vector) -> Vector:
-            slopes = mass_basis(q).slopes
+            _, slopes = mass_basis(q)
             kinetic = 0.5 * jnp.einsum("i,ijl,j->l", qd, coefficients, qd)
             return (coefficients @ (qd @ slopes)) @ qd - slopes @ kinetic
 
         return ClosedForm(
-            mass_matrix=lambda q: coefficients @ mass_basis(q).values,
+            mass_matrix=lambda q: coefficients @ mass_basis(q)[0],
             coriolis=coriolis,
-            potential=None if potential is None else lambda q: potential_basis(q).values[1:] @ potential,
-            gravity=None if potential is None else lambda q: potential_basis(q).slopes[:, 1:] @ potential,
+            potential=None if potential is None else lambda q: potential_basis(q)[0][1:] @ potential,
+            gravity=None if potential is None else lambda q: potential_basis(q)[1][:, 1:] @ potential,
             dissipation=None if friction is None else lambda q, qd: 0.5 * jnp.sum(friction * qd**2),
             friction=None if friction is None else lambda q, qd: friction * qd,
         )
@@ -149,37 +141,33 @@ def _per_joint(name: str, degree: int | tuple[int, ...], d: int) -> tuple[int, .
     return degrees
 
 
-def basis(joints: tuple[JointKind, ...], degrees: tuple[int, ...], q: Vector) -> Basis:
-    """Returns the products over joints of the joints' functions, and their partial derivatives."""
-    factors = [_joint_basis(*joint) for joint in zip(joints, degrees, q, strict=True)]
-    values = [factor.values for factor in factors]
-    slopes = [
-        _products([*values[:joint], factor.slopes[0], *values[joint + 1 :]]) for joint, factor in enumerate(factors)
-    ]
-    return Basis(_products(values), jnp.stack(slopes))
+def basis(
+    joints: tuple[JointKind, ...], degrees: tuple[int, ...], q: Vector
+) -> tuple[Float[Array, " B"], Float[Array, "d B"]]:
+    """Returns the basis functions b, the first of which is 1, and their derivatives db/dq."""
+    values, slopes = zip(*map(_joint_basis, joints, degrees, q), strict=True)
+    along = [_products([*values[:joint], slope, *values[joint + 1 :]]) for joint, slope in enumerate(slopes)]
+    return _products(values), jnp.stack(along)
 
 
-def _joint_basis(joint: JointKind, degree: int, x: Scalar) -> Basis:
+def _joint_basis(joint: JointKind, degree: int, x: Scalar) -> tuple[Array, Array]:
+    """Returns the functions of one joint, and their derivatives."""
     one, zero = jnp.ones(1, x.dtype), jnp.zeros(1, x.dtype)
+    orders = np.arange(1, degree + 1)
     if joint == "revolute":
-        orders = np.arange(1, degree + 1)
         cosines, sines = jnp.cos(orders * x), jnp.sin(orders * x)
-        values = jnp.concatenate([one, cosines, sines])
-        slopes = jnp.concatenate([zero, -orders * sines, orders * cosines])
-    else:
-        values = jnp.concatenate([one, *(jnp.reshape(x**order, 1) for order in range(1, degree + 1))])
-        slopes = jnp.concatenate([zero, np.arange(1, degree + 1) * values[:-1]])
-    return Basis(values, slopes[None])
+        return jnp.concatenate([one, cosines, sines]), jnp.concatenate([zero, -orders * sines, orders * cosines])
+    values = jnp.concatenate([one, *(jnp.reshape(x**order, 1) for order in range(1, degree + 1))])
+    return values, jnp.concatenate([zero, orders * values[:-1]])
 
 
-def _products(factors: list[Array]) -> Float[Array, " B"]:
+def _products(factors: Sequence[Array]) -> Float[Array, " B"]:
     return functools.reduce(lambda products, factor: jnp.outer(products, factor).ravel(), factors)
 
 
 def _size(joints: tuple[JointKind, ...], degrees: tuple[int, ...]) -> int:
-    """Returns B."""
-    sizes = (2 * n + 1 if joint == "revolute" else n + 1 for joint, n in zip(joints, degrees, strict=True))
-    return int(np.prod([*sizes]))
+    """Returns the number of basis functions, B."""
+    return math.prod(2 * n + 1 if joint == "revolute" else n + 1 for joint, n in zip(joints, degrees, strict=True))
 
 
 class PlanarChainParameters(NamedTuple):
@@ -236,7 +224,7 @@ def make_planar_chain(
     if signs.shape != (d,) or not (np.abs(signs) == 1).all():
         raise InputError(f"directions are {directions}; expected 1 or -1 for each of the {d} joints")
     # phi and displacements = absolute q, and rates of the joints w = relative qd.
-    sums = np.where(hinge[:, None] & hinge, np.tril(np.ones((d, d))), np.eye(d))
+    sums = np.where(hinge[:, None] & hinge, np.tri(d), np.eye(d))
     absolute: Any = (sums if coordinates == "relative" else np.eye(d)) * signs
     relative: Any = np.linalg.inv(sums) @ absolute
     turning: Any = hinge[:, None] * absolute
@@ -248,7 +236,7 @@ def make_planar_chain(
             return jnp.zeros(count, dtype) if wanted else None
 
         return PlanarChainParameters(
-            moments=jnp.asarray((triangle[0] == triangle[1]).astype(float), dtype),
+            moments=jnp.asarray(triangle[0] == triangle[1], dtype),
             skew=zeros(len(below[0]), not symmetric),
             armature=zeros(len(geared), armature),
             weight=zeros(d, needs.gravity),
@@ -259,10 +247,10 @@ def make_planar_chain(
 
     def energies(parameters: PlanarChainParameters) -> ClosedForm:
         moments, skew, motors, weight, sideways, viscous, coulomb = parameters
-        like = jnp.zeros((d, d), moments.dtype)
-        A = like.at[triangle].set(moments)
-        A = A + A.T - jnp.diag(jnp.diagonal(A))
-        B = None if skew is None else like.at[below].set(skew) - like.at[below].set(skew).T
+        zero = jnp.zeros((d, d), moments.dtype)
+        lower = zero.at[triangle].set(moments)
+        A = lower + jnp.tril(lower, -1).T
+        B = None if skew is None else zero.at[below].set(skew) - zero.at[below].set(skew).T
         fixed = 0.0 if motors is None else relative.T @ jnp.diag(jnp.zeros(d).at[geared].set(motors)) @ relative
 
         def mass_matrix(q: Vector) -> Matrix:
@@ -280,17 +268,9 @@ def make_planar_chain(
             height = weight @ jnp.where(hinge, jnp.cos(place), -(place**2) / 2)
             return -height if sideways is None else -height - sideways @ jnp.where(hinge, jnp.sin(place), place)
 
-        dissipation = None
-        if viscous is not None:
-            dissipation = joint_dissipation(viscous, coulomb, velocity_scale=velocity_scale, joint_map=relative)
-        return ClosedForm(
-            mass_matrix=mass_matrix,
-            coriolis=coriolis,
-            potential=None if weight is None else potential,
-            gravity=None if weight is None else jax.grad(potential),
-            dissipation=dissipation,
-            friction=None if dissipation is None else jax.grad(dissipation, argnums=1),
-        )
+        dissipation = joint_dissipation(viscous, coulomb, velocity_scale=velocity_scale, joint_map=relative)
+        held = (None, None) if weight is None else (potential, jax.grad(potential))
+        return ClosedForm(mass_matrix, coriolis, *held, dissipation)
 
     return Model(init, energies)
 
