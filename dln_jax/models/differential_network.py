@@ -10,9 +10,8 @@ from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from dln_jax.mechanics.arguments import vectors
-from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import Activation
-from dln_jax.nn.differential_mlp import Layers
+from dln_jax.nn.differential_mlp import Layers, init_ensemble, layer_shapes, value_jacobian_and_hessian
 from dln_jax.sizes import require_network
 from dln_jax.types import VectorLike, require_positive
 
@@ -47,19 +46,15 @@ def make_differential_network(
         InputError: invalid sizes, too large a network, or no members.
     """
     require_positive(members=members)
-    differential_mlp.layer_shapes(sizes)
+    layer_shapes(sizes)
     require_network(width=max(sizes), depth=max(len(sizes) - 2, 1))
 
     def derivatives(layers: Layers) -> Callable[[VectorLike], Derivatives]:
         def function(x):
             (inputs,) = vectors(sizes[0], x=x)
-            every = jax.vmap(
-                lambda ours: differential_mlp.value_jacobian_and_hessian(ours, inputs, activation=activation)
-            )(layers)
+            every = jax.vmap(lambda member: value_jacobian_and_hessian(member, inputs, activation=activation))(layers)
             return Derivatives(*(array.mean(axis=0) for array in every))
 
         return function
 
-    return FunctionModel(
-        lambda key: differential_mlp.init_ensemble(key, sizes, members=members, dtype=dtype), derivatives
-    )
+    return FunctionModel(lambda key: init_ensemble(key, sizes, members=members, dtype=dtype), derivatives)

@@ -16,8 +16,8 @@ and the derivatives with respect to x follow from g' and g'' of the activation:
 A backward sweep costs one pass per output, a forward sweep one per input or pair of inputs. `cheaper_jacobian` and
 `cheaper_hessian` count floating point operations, and the shapes decide before anything is compiled.
 
-An ensemble's layers have a leading axis of members. One state, no batch axis: `jax.vmap` over x. In the code the n inputs are the first axis of J [n, width], so that a
-batch of Jacobians and a weight form one matrix product.
+One state, no batch axis: `jax.vmap` over x. The layers of an ensemble have a leading axis of members. In the code the n
+inputs are the first axis of J [n, width], so that a batch of Jacobians and a weight form one matrix product.
 """
 
 from collections.abc import Callable, Sequence

@@ -70,11 +70,13 @@ def textbook(
 ) -> Scene:
     """Builds a scene from its equations, friction and actuation.
 
-    Friction is viscous, D = ½ b |qd|² with the torque b qd; there is none if b (N m s or N s/m) is zero.
+    Friction is viscous, D = ½ b |qd|² with the torque b qd; there is none if b (N m s or N s/m) is zero. Without a
+    potential, `gravity` is not used.
     """
     needs = Needs(joints, gravity=potential is not None, friction=friction != 0, actuation=actuation)
-    dissipation = None if friction == 0 else (lambda q, qd: 0.5 * friction * jnp.sum(qd**2))
-    return Scene(name, needs, mass_matrix, coriolis, potential, gravity, dissipation, tip)
+    force = gravity if needs.gravity else None
+    dissipation = (lambda q, qd: 0.5 * friction * jnp.sum(qd**2)) if needs.friction else None
+    return Scene(name, needs, mass_matrix, coriolis, potential, force, dissipation, tip)
 
 
 def closed_form_forward_dynamics(scene: Scene, q: Vector, qd: Vector, tau: Vector) -> Vector:
