@@ -65,7 +65,7 @@ def _hanging(
         relative: whether q holds angles between neighbours: θ = S q = cumsum(q), M = Sᵀ M_θ S, and likewise for forces.
     """
 
-    def same(x):
+    def same(x: Any) -> Any:
         return x
 
     to_angles, to_joints = (jnp.cumsum, _sum_outwards) if relative else (same, same)
