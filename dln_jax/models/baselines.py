@@ -60,7 +60,7 @@ def make_feed_forward(
         "inverse_dynamics": partial(network, "inverse", accelerations, forces),
         "forward_dynamics": partial(network, "forward", forces, accelerations),
     }
-    return model_of(InverseForward, lambda: terms, needs.degrees_of_freedom, dtype)
+    return model_of(InverseForward, lambda: terms, needs, dtype)
 
 
 def make_phase_network(
@@ -91,7 +91,7 @@ def make_phase_network(
         )
         return outputs[:d], outputs[d:]
 
-    return model_of(PhaseRates, lambda: {"rates": network}, d, dtype)
+    return model_of(PhaseRates, lambda: {"rates": network}, needs, dtype)
 
 
 def make_helmholtz(
@@ -139,4 +139,4 @@ def make_helmholtz(
         "hamiltonian": None if field == "conservative" else partial(scalar, "hamiltonian"),
         "potential": None if field == "solenoidal" else partial(scalar, "potential"),
     }
-    return model_of(record, lambda: terms, needs.degrees_of_freedom, dtype)
+    return model_of(record, lambda: terms, needs, dtype)

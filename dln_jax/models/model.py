@@ -90,7 +90,7 @@ def make_delan(
     terms = partial(
         structured_terms, needs, networks, "cholesky", diagonal_shift, diagonal_floor, shared_trunk=shared_trunk
     )
-    return model_of(NaturalSystem, terms, needs.degrees_of_freedom, dtype)
+    return model_of(NaturalSystem, terms, needs, dtype)
 
 
 def make_black_box_lagrangian(
@@ -112,19 +112,20 @@ def make_black_box_lagrangian(
     """
     rates = per_coordinate(needs, "rate_scale", rate_scale)
     terms = partial(black_box_terms, needs, perceptrons(width, depth, activation), "lagrangian", rates)
-    return model_of(LagrangianSystem, terms, needs.degrees_of_freedom, dtype)
+    return model_of(LagrangianSystem, terms, needs, dtype)
 
 
 def model_of(
-    record: Callable[..., Any], terms: Callable[[], Mapping[str, Callable[..., Any] | None]], d: int, dtype: Any
+    record: Callable[..., Any], terms: Callable[[], Mapping[str, Callable[..., Any] | None]], needs: Needs, dtype: Any
 ) -> Model:
     """Returns the model whose energies are `record(**terms)`.
 
     Args:
         record: takes functions of one state as keywords; absent terms are not passed.
         terms: builds Haiku modules and returns functions that use them, by name; `None` for absent terms.
-        d: degrees of freedom. Parameters are initialised at the arguments (0, 1, ..), where no two bodies coincide.
+        needs: needs of the scene. Parameters are initialised at the arguments (0, 1, ..), where no two bodies coincide.
     """
+    d = needs.degrees_of_freedom
 
     def build():
         functions = {name: term for name, term in terms().items() if term is not None}
