@@ -190,17 +190,18 @@ def tip_paths(
         motions: rollouts from the test's first states under its torques, or none; drawn as long as they are valid.
         model: name of the model, which sets the colour.
     """
-    shown = list(np.unique(test.trajectory))[:MOST_PATHS]
+    shown = np.unique(test.trajectory)[:MOST_PATHS]
     columns = min(len(shown), 4)
     rows = -(-len(shown) // columns)
     figure, axes = style.figure(rows, columns, height=2.3 * rows + 0.55, sharex=True, sharey=True)
-    places = jax.jit(jax.vmap(tip))
+    places, shade = jax.jit(jax.vmap(tip)), style.colour(model)
     positions = np.asarray(places(data.q))
     training = [positions[data.trajectory == index] for index in np.setdiff1d(data.trajectory, test.trajectory)]
-    times, paths = np.zeros(0), []
+    predicted = []
     if motions:
-        times, ends = valid_prediction_times(test, list(motions)), np.cumsum([len(motion.q) for motion in motions])
+        ends = np.cumsum([len(motion.q) for motion in motions])
         paths = np.split(np.asarray(places(np.concatenate([motion.q for motion in motions]))), ends[:-1])
+        predicted = list(zip(valid_prediction_times(test, list(motions)), paths, strict=True))
     for axis in axes.flat:
         axis.set_aspect("equal")
         axis.axis("off")
@@ -209,14 +210,15 @@ def tip_paths(
         axis.add_collection(LineCollection(training[:MOST_PATHS], colors="0.94", linewidths=6, capstyle="round"))
         axis.plot(*positions[chosen].T, color="black", linewidth=2.2)
         title = f"{data.label[index]} (test)"
-        if number < len(times):
-            t = data.t[chosen]
-            path = paths[number][t - t[0] <= times[number] + 1e-9]
-            axis.plot(*path.T, "--", color=style.colour(model), linewidth=1.3)
-            axis.plot(*path[-1], "o", color=style.colour(model), markersize=4)
-            title = f"{data.label[index]}: valid for {times[number]:.1f} of {t[-1] - t[0]:.1f} s"
+        if number < len(predicted):
+            valid, path = predicted[number]
+            t = data.t[chosen] - data.t[chosen][0]
+            path = path[t <= valid + 1e-9]
+            axis.plot(*path.T, "--", color=shade, linewidth=1.3)
+            axis.plot(*path[-1], "o", color=shade, markersize=4)
+            title = f"{data.label[index]}: valid for {valid:.1f} of {t[-1]:.1f} s"
         style.title(axis, title, fontsize=style.SMALL)
-    if len(times):
+    if predicted:
         caption = f"black: test; dashed: {model} driven by its torques until the prediction fails; grey: training"
         figure.supxlabel(caption, fontsize=style.SMALL)
     return figure
@@ -239,36 +241,35 @@ def friction_curves(
             hundredth may lie out of view.
         rate_unit, force_unit: one unit for all joints, or one per joint.
     """
-    arrays = {name: (np.asarray(rates), np.asarray(forces)) for name, (rates, forces) in curves.items()}
-    d = next(iter(arrays.values()))[0].shape[1]
-    rate_units, force_units = np.broadcast_to(rate_unit, d), np.broadcast_to(force_unit, d)
-    alike = len({*zip(rate_units, force_units, strict=True)}) == 1
+    colours, d = style.colours_of(curves), np.shape(next(iter(curves.values()))[0])[1]
+    units = list(zip(np.broadcast_to(rate_unit, d), np.broadcast_to(force_unit, d), strict=True))
+    alike = len({*units}) == 1
     columns = min(d, MOST_COLUMNS)
     rows = -(-d // columns)
     figure, axes = style.figure(rows, columns, height=0.6 + 2.4 * rows)
     for axis in axes.flat[d:]:
         axis.set_visible(False)
     for joint, axis in enumerate(axes.flat[:d]):
+        drawn = {name: tuple(np.asarray(values)[:, joint] for values in curve) for name, curve in curves.items()}
         if measured is not None:
             rates, forces = (np.asarray(values)[:, joint] for values in measured)
-            every = slice(None, None, -(-len(rates) // MOST_SAMPLES))
+            every = -(-len(rates) // MOST_SAMPLES)
             points = {"color": style.REFERENCE, "markersize": 1.5, "rasterized": True, "label": "measured"}
-            axis.plot(rates[every], forces[every], ".", **points)
-            seen = [np.percentile(forces, [0.5, 99.5]), *(forces[:, joint] for _, forces in arrays.values())]
-            low, high = float(min(map(np.min, seen))), float(max(map(np.max, seen)))
-            room = 0.1 * (high - low) or 1.0
-            axis.set_ylim(low - room, high + room)
-        for colour, (name, (rates, forces)) in zip(itertools.cycle(style.CYCLE), arrays.items(), strict=False):
-            order = np.argsort(rates[:, joint])
-            axis.plot(rates[order, joint], forces[order, joint], color=colour, linewidth=1.3, label=name)
+            axis.plot(rates[::every], forces[::every], ".", **points)
+            seen = np.concatenate([np.percentile(forces, [0.5, 99.5]), *(forces for _, forces in drawn.values())])
+            room = 0.1 * np.ptp(seen) or 1.0
+            axis.set_ylim(seen.min() - room, seen.max() + room)
+        for name, (rates, forces) in drawn.items():
+            order = np.argsort(rates)
+            axis.plot(rates[order], forces[order], color=colours[name], linewidth=1.3, label=name)
         axis.axhline(0, color="black", linewidth=0.5)
         axis.locator_params(axis="x", nbins=5)
         if d > 1:
             style.title(axis, names[joint] if names else f"joint {joint + 1}")
         if joint >= d - columns or not alike:
-            axis.set_xlabel(f"rate, {rate_units[joint]}")
+            axis.set_xlabel(f"rate, {units[joint][0]}")
         if joint % columns == 0 or not alike:
-            axis.set_ylabel(f"friction, {force_units[joint]}")
+            axis.set_ylabel(f"friction, {units[joint][1]}")
     style.legend_beside(figure, axes[0, 0], columns=4)
     return figure
 
@@ -293,24 +294,23 @@ def excitation_figure(
         for joint, axis in enumerate(line):
             for index, name in enumerate(data.label):
                 samples = data.trajectory == index
-                look = {"color": colours[name], "linewidth": 0.8, "label": str(name)}
-                axis.plot(data.t[samples], getattr(data, key)[samples, joint], **look)
-            for bound in limits[key][joint]:
-                if np.isfinite(bound):
-                    axis.axhline(bound, color=style.REFERENCE, linestyle="--", linewidth=0.9)
+                values = getattr(data, key)[samples, joint]
+                axis.plot(data.t[samples], values, color=colours[name], linewidth=0.8, label=str(name))
+            for bound in filter(np.isfinite, limits[key][joint]):
+                axis.axhline(bound, color=style.REFERENCE, linestyle="--", linewidth=0.9)
             axis.tick_params(labelsize=6.5)
         line[0].set_ylabel(f"{quantity}, {style.unit_of(data, 0, key)}")
-    for joint in range(joints):
-        unit = style.unit_of(data, joint, "q")
-        differs = "" if unit == style.unit_of(data, 0, "q") else f" ({unit})"
-        style.title(axes[0, joint], f"{names[joint]:.12}{differs}", fontsize=style.SMALL)
-        axes[-1, joint].set_xlabel("time, s", fontsize=style.SMALL)
+    units = [style.unit_of(data, joint, "q") for joint in range(joints)]
+    for unit, name, column in zip(units, names, axes.T, strict=False):
+        differs = "" if unit == units[0] else f" ({unit})"
+        style.title(column[0], f"{name:.12}{differs}", fontsize=style.SMALL)
+        column[-1].set_xlabel("time, s", fontsize=style.SMALL)
     for place, (name, values) in enumerate(conditions.items()):
         shade = style.REFERENCE if name == "random" else style.BLUE
-        below.plot(values, np.full(len(values), place), "o", color=shade, markersize=4, alpha=0.8)
+        below.plot(values, [place] * len(values), "o", color=shade, markersize=4, alpha=0.8)
     below.set_yticks(range(len(conditions)), list(conditions))
-    below.set_ylim(len(conditions) - 0.5, -0.5)
-    below.set_xscale(style.scale_of(itertools.chain(*conditions.values())))
-    below.set_xlabel("condition of the regressor, columns of unit length")
+    scale = style.scale_of(itertools.chain(*conditions.values()))
+    label = "condition of the regressor, columns of unit length"
+    below.set(ylim=(len(conditions) - 0.5, -0.5), xscale=scale, xlabel=label)
     style.legend_beside(figure, axes[0, 0], columns=6)
     return figure
