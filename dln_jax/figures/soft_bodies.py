@@ -85,7 +85,7 @@ def energies_against_time(
     return figure
 
 
-def moments_figure(panels: Sequence[Moments], *, columns: int = 2, width: float = style.WIDTH) -> Figure:
+def moments_figure(panels: Sequence[Moments], *, columns: int = 2) -> Figure:
     """Snapshots of bodies with their times, one panel per body, earlier ones paler.
 
     Raises:
@@ -99,6 +99,7 @@ def moments_figure(panels: Sequence[Moments], *, columns: int = 2, width: float 
     # The last panel fills the rest of its row, and a row is as high as its highest panel.
     shapes = [np.divide(*(high - low)[::-1]) for _, low, high in places]
     shapes = [max(shapes[i] * len(row) / columns for i in row) for row in rows]
+    width = style.WIDTH
     if columns == 1:
         width = min(width, max(_HIGHEST / shapes[0] + 0.6, 0.09 * len(panels[0].title)))
     heights = [np.clip(width / columns * shape, 1.2, _HIGHEST) + 0.55 for shape in shapes]

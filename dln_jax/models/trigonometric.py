@@ -10,24 +10,25 @@ The basis b is the product over joints of {1, cos q, .., cos nq, sin q, .., sin 
 is linear in all parameters, so a linear least-squares problem identifies them (`learning.linear`), as Atkeson, An and
 Hollerbach (1986, "Estimation of inertial parameters of manipulator loads and links") did for rigid bodies.
 
-The basis contains rigid links on revolute joints: V has degree 1 in every angle, and M degree 1 if the chain is planar,
-otherwise 2. M is definite only where the data make it so; a singular M gives non-finite accelerations.
+Rigid links on revolute joints need degree 1 in every angle for V; M needs degree 1 if the chain is planar and 2
+otherwise. The form does not make M positive definite, only the data do; a singular M gives non-finite accelerations.
 
-A chain of links in one plane, on a fixed base, a slide or several, needs fewer parameters (`make_planar_chain`). With
-the links' absolute angles phi, measured from hanging straight down,
+A planar chain on a fixed base, or on one or more slides, needs fewer parameters (`make_planar_chain`). With the links'
+absolute angles phi, measured from hanging straight down,
 
     T = ½ sum_ij (A_ij cos(phi_i - phi_j) + B_ij sin(phi_i - phi_j)) phid_i phid_j + ½ sum_i a_i w_i²
     V = -sum_i (g_i cos phi_i + h_i sin phi_i)
     D = sum_i ½ b_i w_i² + c_i v log cosh(w_i / v),   w_i = phid_i - phid_{i-1}, the joint's rate
 
-A is symmetric and B skew. B and h vanish if the centres of mass lie on the lines between joints and the zeros of the
-angles are right; the armature a_1 of the first motor is part of A_11. All parameters enter linearly
-(`learning.linear.fit_linear`) and are identifiable from motions ("base parameters"): for a double pendulum, g_2 / A_12
-is the acceleration of gravity divided by the first link's length. Friction acts in the joints, for any coordinates.
+A is symmetric and B skew. B and h vanish if every centre of mass lies on the line between its joints and the angles are
+zero at rest; A_11 includes the armature a_1 of the first motor. All parameters enter linearly
+(`learning.linear.fit_linear`), and motions identify all of them ("base parameters"): for a double pendulum, g_2 / A_12
+is the acceleration of gravity divided by the length of the first link. Friction acts in the joints, whatever the
+coordinates.
 
-Slides, which come before all hinges, have phi = 0: A_ij and B_ij of a slide and a link are the components of a mass
-times a length along the slide. Their phid in T is the rate of the displacement x, and V has g_i x²/2 - h_i x, a spring
-and the weight along the slide, in place of their other terms.
+Slides come before all hinges and have phi = 0; in T, the rate of their displacement x takes the place of phid. A_ij and
+B_ij of a slide and a link are the components of a mass times a length along the slide. For a slide, V contains
+g_i x²/2 - h_i x: a spring, and the weight along the slide.
 """
 
 import functools
@@ -48,7 +49,8 @@ from dln_jax.models.model import Model
 from dln_jax.types import InputError, JointKind, Matrix, Needs, Scalar, Vector, require_positive
 
 MOST_COEFFICIENTS = 20_000
-"""Limit on the coefficients of the mass matrix, which grow exponentially with the joints (the fit with the square)."""
+"""Largest number of coefficients of the mass matrix. The number grows exponentially with the joints, and the cost of a
+fit with its square."""
 SPRING_DEGREE = 2
 """Lower bound on the degree of the potential in a prismatic displacement, so that it includes a linear spring."""
 
@@ -76,10 +78,10 @@ def make_trigonometric(
     `init` ignores its key: M = 1, V = 0, no friction. The number of parameters grows like (2 degree + 1)^d d²/2.
 
     Args:
-        degree: degree of the basis in every joint, or one for all; >= 0. In a prismatic displacement the potential has
-            at least degree 2 (a linear spring).
-        potential_degree: degree of the potential if it differs: M of a chain on a fixed base does not depend on its
-            first joint, but V does.
+        degree: degree of the basis, >= 0: one for all joints, or one per joint. In a prismatic displacement the
+            potential has at least degree 2 (a linear spring).
+        potential_degree: degree of the potential, if it differs from that of the mass matrix. On a fixed base, V
+            depends on the first joint and M does not.
 
     Raises:
         InputError: a degree is not an integer >= 0, the number of degrees is wrong, or the basis is too large to fit.

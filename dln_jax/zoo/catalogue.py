@@ -14,8 +14,12 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 
 from dln_jax.mechanics.trees.description import tree_from_json
-from dln_jax.models.baselines import make_feed_forward, make_helmholtz, make_phase_network
-from dln_jax.models.differential_network import make_differential_network
+from dln_jax.models.baselines import (
+    make_differential_network,
+    make_feed_forward,
+    make_helmholtz,
+    make_phase_network,
+)
 from dln_jax.models.hamiltonian import (
     make_black_box_hamiltonian,
     make_dissipative,
