@@ -125,7 +125,7 @@ def _place(panel: Moments) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns by how much snapshots are lowered [k], and the lower left and the upper right corner of the panel."""
     positions = _fitting(f"positions of '{panel.title}'", panel.positions, panel.mesh)
     if len(panel.t) != len(positions):
-        raise InputError(f"'{panel.title}' has {len(panel.t)} times for {len(positions)} snapshots")
+        raise InputError(f"'{panel.title}' has {len(panel.t)} times for {len(positions)} snapshots; expected as many")
     flat = flattened(positions)
     drops = 1.4 * float(np.ptp(flat[..., 1], axis=1).max()) * panel.stacked * np.arange(len(flat))
     points = _lowered(flat, drops)

@@ -308,10 +308,9 @@ def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLi
         raise InputError(f"degree {degree} makes {len(terms)} terms; the limit is {MOST_TERMS}: lower the degree")
 
     def table(revolute: bool, x: Scalar) -> Float[Array, " functions"]:
-        if not revolute:
-            return jnp.stack([jnp.ones_like(x), *(x**n for n in range(1, degree + 1))])
-        waves = [wave(n * x) for n in range(1, degree + 1) for wave in (jnp.cos, jnp.sin)]
-        return jnp.stack([jnp.ones_like(x), *waves])
+        orders = range(1, degree + 1)
+        values = [wave(n * x) for n in orders for wave in (jnp.cos, jnp.sin)] if revolute else [x**n for n in orders]
+        return jnp.stack([jnp.ones_like(x), *values])
 
     def values(q: Vector, p: Vector) -> Float[Array, " terms"]:
         product = jnp.ones(len(terms), p.dtype)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.closed_form import ClosedForm
@@ -88,13 +88,6 @@ def closed_form_forward_dynamics(scene: Scene, q: Vector, qd: Vector, tau: Vecto
 def no_coriolis(q: Vector, qd: Vector) -> Vector:
     """Returns the Coriolis force of a constant mass matrix, zero."""
     return jnp.zeros_like(q)
-
-
-def actuation_matrix(needs: Needs) -> Float[Array, "d u"]:
-    """Returns B [d, u] in tau = B control; the identity if every coordinate has its own motor."""
-    if needs.actuation is None:
-        return jnp.eye(needs.degrees_of_freedom)
-    return jnp.asarray(needs.actuation)
 
 
 def with_friction(

@@ -19,7 +19,7 @@ from dln_jax.mechanics.integrators import adaptive_rollout, second_order
 from dln_jax.precision import in_float64
 from dln_jax.scenes.datasets.letters import LETTERS, letter_path, require_finite
 from dln_jax.scenes.pendulums import joint_angles, two_link_arm
-from dln_jax.scenes.scene import Scene, actuation_matrix, closed_form_forward_dynamics
+from dln_jax.scenes.scene import Scene, closed_form_forward_dynamics
 from dln_jax.sizes import require_memory
 from dln_jax.types import InputError, require_seed
 
@@ -103,7 +103,7 @@ def uniform(
     if scene.needs.actuation is None:
         qdd = random.uniform(-acceleration_bound, acceleration_bound, (samples, d))
     else:
-        matrix = actuation_matrix(scene.needs)
+        matrix = jnp.asarray(scene.needs.actuation)
         control = random.uniform(-control_bound, control_bound, (samples, matrix.shape[1]))
         qdd = _batched(closed_form_forward_dynamics, scene)(q, qd, control @ matrix.T)
     order = np.arange(samples)
