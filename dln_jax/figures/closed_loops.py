@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
-from matplotlib.ticker import FixedLocator, FuncFormatter
 
 from dln_jax.control.closed_loop import ClosedLoopRun
 from dln_jax.figures import style
@@ -64,17 +63,18 @@ def closed_loop_traces(
         values, level = x[:MOST_SHOWN, :, joint], goal[joint]
         if kind == "revolute":
             values, level = np.arctan2(np.sin(values - level), np.cos(values - level)), 0.0
+            jumps = np.abs(np.diff(values, prepend=values[:, :1])) > np.pi
+            values = np.where(jumps, np.nan, values)
             angle_ticks(axis.yaxis)
             axis.set_ylim(-1.05 * np.pi, 1.05 * np.pi)
-        _curves(axis, t, values, turning=kind == "revolute")
+        _curves(axis, t, values)
         axis.axhline(level, **dashed)
         name = names[joint] if names else f"q{joint + 1}"
         axis.set_ylabel(f"{name}, {'rad' if kind == 'revolute' else 'm'}")
     for control, axis in enumerate(axes[d : d + m, 0]):
         axis.plot(t[:-1], u[0, :, control], color=style.BLUE, linewidth=1.6, drawstyle="steps-post")
-        for limit in limits:
-            if np.isfinite(level := np.broadcast_to(limit, m)[control]):
-                axis.axhline(level, color=style.VERMILLION, linewidth=1.2)
+        for limit in filter(np.isfinite, [np.broadcast_to(limit, m)[control] for limit in limits]):
+            axis.axhline(limit, color=style.VERMILLION, linewidth=1.2)
         axis.set_ylabel(f"control, {unit}" if m == 1 else f"u{control + 1}, {unit}")
         axis.margins(y=0.15)
     if energy is not None:
@@ -88,23 +88,15 @@ def closed_loop_traces(
     return figure
 
 
-def _curves(axis: Axes, t: np.ndarray, values: np.ndarray, *, turning: bool = False) -> None:
-    """Draws curves with the first in front; angles have gaps where they wrap."""
-    for number in reversed(range(len(values))):
-        colour, width = (style.SKY, 0.6) if number else (style.BLUE, 1.6)
-        axis.plot(t, _with_gaps(values[number]) if turning else values[number], color=colour, linewidth=width)
-
-
-def _with_gaps(angle: np.ndarray) -> np.ndarray:
-    """Returns angles with NaN where a wrapped angle jumps by a full turn."""
-    return np.where(np.abs(np.diff(angle, prepend=angle[0])) > np.pi, np.nan, angle)
+def _curves(axis: Axes, t: np.ndarray, values: np.ndarray) -> None:
+    """Draws curves [K, T] with the first in front."""
+    axis.plot(t, values[:0:-1].T, color=style.SKY, linewidth=0.6)
+    axis.plot(t, values[0], color=style.BLUE, linewidth=1.6)
 
 
 def angle_ticks(side: Axis) -> None:
     """Puts ticks at multiples of pi / 2 over the full circle."""
-    side.set_major_locator(FixedLocator([-np.pi, -np.pi / 2, 0.0, np.pi / 2, np.pi]))
-    names = {-2: "-π", -1: "-π/2", 0: "0", 1: "π/2", 2: "π"}
-    side.set_major_formatter(FuncFormatter(lambda value, _: names[round(2 * value / np.pi)]))
+    side.set_ticks(np.pi / 2 * np.arange(-2, 3), ["-π", "-π/2", "0", "π/2", "π"])
 
 
 def cart_pole_drawing(length: float) -> Drawing:
@@ -139,20 +131,18 @@ def rotary_pendulum_drawing(arm: float, pole: float) -> Drawing:
     """Returns the drawing of a rotary pendulum, q = (arm, pole from upright) in rad, seen obliquely; lengths in m."""
 
     def prepare(axis: Axes, q: np.ndarray, trail: int) -> Callable[[int], None]:
-        out = np.stack([np.cos(q[:, 0]), np.sin(q[:, 0]), 0 * q[:, 0]], axis=1)
-        across = np.stack([-np.sin(q[:, 0]), np.cos(q[:, 0]), 0 * q[:, 0]], axis=1)
-        hinge = arm * out
-        tip = hinge + pole * (np.sin(q[:, 1:]) * across + np.cos(q[:, 1:]) * np.array([0.0, 0.0, 1.0]))
-        turn = np.linspace(0, 2 * np.pi, 120)[:, None]
-        ring = np.concatenate([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+        hinge = arm * _direction(q[:, 0])
+        across, upright = _direction(q[:, 0] + np.pi / 2), np.array([0.0, 0.0, 1.0])
+        tip = hinge + pole * (np.sin(q[:, 1:]) * across + np.cos(q[:, 1:]) * upright)
+        ring = _direction(np.linspace(0, 2 * np.pi, 120))
         floor, reach = np.array([0.0, 0.0, -1.1 * pole]), float(np.hypot(arm, pole))
-        disc, post = _seen(reach * ring + floor), _seen(np.stack([floor, np.zeros(3)]))
+        disc = _seen(reach * ring + floor)
         axis.fill(*disc.T, facecolor="0.95", edgecolor="none", zorder=0)
         axis.plot(*_seen(arm * ring).T, color="0.85", linewidth=1.0, zorder=1)
-        axis.plot(*post.T, color=GROUND, linewidth=9, solid_capstyle="butt", zorder=1)
+        axis.plot(*_seen([floor, np.zeros(3)]).T, color=GROUND, linewidth=9, solid_capstyle="butt", zorder=1)
         (shadow,) = axis.plot([], [], color="0.82", linewidth=4, solid_capstyle="round", zorder=0.5)
         (beam,) = axis.plot([], [], color=BODY, linewidth=7, solid_capstyle="round", zorder=3)
-        axis.plot(*_seen(np.zeros((1, 3))).T, "o", color=BODY, markersize=13, zorder=3)
+        axis.plot(0, 0, "o", color=BODY, markersize=13, zorder=3)
         flat, hinges = _seen(tip), _seen(hinge)
         moving = _rod(axis, flat, trail)
         top = float(flat[:, 1].max()) + 0.12 * reach
@@ -161,7 +151,7 @@ def rotary_pendulum_drawing(arm: float, pole: float) -> Drawing:
 
         def show(index: int) -> None:
             beam.set_data(*np.stack([np.zeros(2), hinges[index]]).T)
-            fallen = np.stack([np.zeros(3), hinge[index], tip[index]]) * np.array([1.0, 1.0, 0.0]) + floor
+            fallen = np.stack([np.zeros(3), hinge[index], tip[index]]) * (1.0 - upright) + floor
             shadow.set_data(*_seen(fallen).T)
             moving(index, hinges[index])
 
@@ -206,9 +196,8 @@ def write_closed_loop_gif(
     trace.plot(t, u, color="0.85", linewidth=1.0, drawstyle="steps-post")
     (line,) = trace.plot([], [], color=style.BLUE, linewidth=1.4, drawstyle="steps-post")
     (now,) = trace.plot([], [], "o", color=style.BLUE, markersize=4)
-    for limit in limits:
-        if np.isfinite(limit):
-            trace.axhline(limit, color=style.VERMILLION, linewidth=1.2)
+    for limit in filter(np.isfinite, limits):
+        trace.axhline(limit, color=style.VERMILLION, linewidth=1.2)
     trace.set(xlabel="t, s", ylabel=f"control, {unit}", xlim=(t[0], t[-1]))
     trace.margins(y=0.12)
 
@@ -236,10 +225,14 @@ def _rod(axis: Axes, tip: np.ndarray, trail: int) -> Callable[[int, np.ndarray],
     return show
 
 
+def _direction(angle: np.ndarray) -> np.ndarray:
+    """Returns horizontal unit vectors [..., 3]."""
+    return np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
+
+
 def _seen(points: Any) -> np.ndarray:
     """Projects points in space [..., 3] orthographically to the drawing plane [..., 2]."""
     azimuth, elevation = VIEW
-    x, y, z = np.moveaxis(np.asarray(points), -1, 0)
-    right = x * np.cos(azimuth) + y * np.sin(azimuth)
-    back = -x * np.sin(azimuth) + y * np.cos(azimuth)
-    return np.stack([right, z * np.cos(elevation) + back * np.sin(elevation)], axis=-1)
+    right, back = _direction(azimuth), _direction(azimuth + np.pi / 2)
+    up = np.sin(elevation) * back + np.array([0.0, 0.0, np.cos(elevation)])
+    return np.asarray(points) @ np.stack([right, up], axis=1)

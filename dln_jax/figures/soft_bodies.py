@@ -4,7 +4,6 @@ Bodies in the plane are drawn as triangles, those in space by their skin, seen o
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,10 +16,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from dln_jax.figures import style
-from dln_jax.figures.animations import DPI, write_gif
+from dln_jax.figures.animations import DPI
 from dln_jax.metrics.soft_body_energies import KINETIC, TOTAL
 from dln_jax.softbody.mesh.mesh import Mesh, boundary
-from dln_jax.types import InputError, require_positive
+from dln_jax.types import InputError
 
 COLOURS = {
     KINETIC: style.VERMILLION,
@@ -86,7 +85,7 @@ def energies_against_time(
     return figure
 
 
-def moments_figure(panels: Sequence[Moments], *, columns: int = 2, width: float = style.WIDTH) -> Figure:
+def moments_figure(panels: Sequence[Moments], *, columns: int = 2) -> Figure:
     """Snapshots of bodies with their times, one panel per body, earlier ones paler.
 
     Raises:
@@ -98,7 +97,9 @@ def moments_figure(panels: Sequence[Moments], *, columns: int = 2, width: float 
     columns = min(columns, len(panels))
     rows = [range(i, min(i + columns, len(panels))) for i in range(0, len(panels), columns)]
     # The last panel fills the rest of its row, and a row is as high as its highest panel.
-    shapes = [max(np.divide(*(places[i].high - places[i].low)[::-1]) * len(row) / columns for i in row) for row in rows]
+    shapes = [np.divide(*(high - low)[::-1]) for _, low, high in places]
+    shapes = [max(shapes[i] * len(row) / columns for i in row) for row in rows]
+    width = style.WIDTH
     if columns == 1:
         width = min(width, max(_HIGHEST / shapes[0] + 0.6, 0.09 * len(panels[0].title)))
     heights = [np.clip(width / columns * shape, 1.2, _HIGHEST) + 0.55 for shape in shapes]
@@ -108,70 +109,65 @@ def moments_figure(panels: Sequence[Moments], *, columns: int = 2, width: float 
         for column, i in enumerate(row):
             axis = figure.add_subplot(grid[number, column : columns if i == row[-1] else column + 1])
             style.prepare(axis)
-            _draw(axis, panels[i], places[i])
+            _draw(axis, panels[i], *places[i])
     return figure
 
 
-class _Place(NamedTuple):
-    offsets: np.ndarray
-    """Offset of every snapshot [k, 2]."""
-    points: np.ndarray
-    """Vertices in the drawing plane [k, n, 2]."""
-    low: np.ndarray
-    high: np.ndarray
-    """Corners of the panel."""
+def _fitting(name: str, positions: np.ndarray, mesh: Mesh) -> np.ndarray:
+    positions = np.asarray(positions)
+    if positions.shape[1:] != mesh.vertices.shape or not len(positions):
+        vertices, dimension = mesh.vertices.shape
+        raise InputError(f"{name} have shape {list(positions.shape)}; expected [T, {vertices}, {dimension}], T > 0")
+    return positions
 
 
-def _place(panel: Moments) -> _Place:
-    positions = np.asarray(panel.positions)
-    if positions.ndim != 3 or positions.shape[1:] != panel.mesh.vertices.shape or len(positions) != len(panel.t):
-        raise InputError(
-            f"'{panel.title}' has positions {list(positions.shape)} at {len(panel.t)} times; "
-            f"expected [k, {panel.mesh.vertices.shape[0]}, {panel.mesh.dimension}] at k"
-        )
+def _place(panel: Moments) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns by how much snapshots are lowered [k], and the lower left and the upper right corner of the panel."""
+    positions = _fitting(f"positions of '{panel.title}'", panel.positions, panel.mesh)
+    if len(panel.t) != len(positions):
+        raise InputError(f"'{panel.title}' has {len(panel.t)} times for {len(positions)} snapshots; expected as many")
     flat = flattened(positions)
-    pitch = 1.4 * float(np.ptp(flat[..., 1], axis=1).max()) * panel.stacked
-    offsets = -pitch * np.arange(len(flat))[:, None] * np.array([0.0, 1.0])
-    points = flat + offsets[:, None]
+    drops = 1.4 * float(np.ptp(flat[..., 1], axis=1).max()) * panel.stacked * np.arange(len(flat))
+    points = _lowered(flat, drops)
     low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
     if panel.ground is not None and not panel.stacked:
         low[1] = min(low[1], panel.ground * low[0])
     margin = 0.05 * float((high - low).max())
     # Margins leave room for the times.
-    sides = np.array([1.0 if panel.stacked else 4.0, 1.5]), np.array([1.0 if panel.stacked else 3.0, 3.0])
-    return _Place(offsets, points, low - margin * sides[0], high + margin * sides[1])
+    below, above = ([1.0, 1.5], [1.0, 3.0]) if panel.stacked else ([4.0, 1.5], [3.0, 3.0])
+    return drops, low - margin * np.array(below), high + margin * np.array(above)
 
 
-def _draw(axis: Axes, panel: Moments, place: _Place) -> None:
-    low, high = place.low, place.high
-    plane, count = panel.mesh.dimension == 2, len(place.points)
-    levels = place.offsets[:, 1] if panel.stacked else np.zeros(1)
+def _lowered(points: np.ndarray, drops: Any) -> np.ndarray:
+    return points - np.multiply.outer(drops, [0.0, 1.0])[..., None, :]
+
+
+def _draw(axis: Axes, panel: Moments, drops: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
+    positions, mesh, count = np.asarray(panel.positions), panel.mesh, len(drops)
+    flat = _lowered(flattened(positions), drops)
     ground = np.zeros((0, 2))
-    if panel.ground is not None and plane:
-        along = np.linspace(low[0], high[0], 100)
-        ground = np.stack([along, panel.ground * along], axis=-1)
-        for level in levels:
-            line = straight_ground((low[0], high[0]), level, panel.ground)
-            draw_ground(axis, line, depth=0.02 * (high[0] - low[0]))
+    if panel.ground is not None and mesh.dimension == 2:
+        ground = straight_ground(np.linspace(low[0], high[0], 100), 0.0, panel.ground)
+        for drop in np.unique(drops):
+            draw_ground(axis, _lowered(ground, drop), depth=0.02 * (high[0] - low[0]))
     elif panel.ground == 0.0:
-        axis.fill(*floor(np.asarray(panel.positions), 0.0).T, color=GROUND, zorder=0)
-    for number, x in enumerate(np.asarray(panel.positions)):
+        axis.fill(*floor(positions, 0.0).T, color=GROUND, zorder=0)
+    skin = np.unique(boundary(mesh))
+    for number, (x, points, t) in enumerate(zip(positions, flat, panel.t, strict=True)):
         pale = 0.0 if panel.stacked else _FADED * (1.0 - number / max(count - 1, 1))
-        add_body(axis, panel.mesh, pale=pale, zorder=2 + 3 * number)(x, place.offsets[number])
-    skin = np.unique(boundary(panel.mesh))
-    for number, (points, t) in enumerate(zip(place.points, panel.t, strict=True)):
+        add_body(axis, mesh, pale=pale, zorder=2 + 3 * number)(x, drops[number])
         corner, side = np.array([points[:, 0].mean(), points[:, 1].max()]), np.array([0.0, 1.0])
         if not panel.stacked and count > 1:
             # The time is placed at the skin vertex that is farthest from the ground and the other snapshots.
-            others = np.concatenate([ground, *np.delete(place.points, number, axis=0)])
+            others = np.concatenate([ground, *np.delete(flat, number, axis=0)])
             room = np.linalg.norm(points[skin][:, None] - others, axis=-1).min(axis=1)
             corner = points[skin][room.argmax()]
             side = (corner - points.mean(axis=0)) / np.linalg.norm(np.ptp(points, axis=0))
             side[0] -= 0.5 * (panel.ground or 0.0)  # away from sloping ground
-        (x, y), (i, j) = corner.tolist(), np.sign(np.round(3 * side)).astype(int).tolist()
+        i, j = np.sign(np.round(3 * side)).astype(int).tolist()
         align = {"ha": ("center", "left", "right")[i], "va": ("center", "bottom", "top")[j]}
         look = {"fontsize": 7.5, "color": "0.25", "zorder": 100, **align}
-        axis.annotate(f"{t:.2f} s", (x, y), (4.0 * i, 4.0 * j), textcoords="offset points", **look)
+        axis.annotate(f"{t:.2f} s", corner.tolist(), (4.0 * i, 4.0 * j), textcoords="offset points", **look)
     axis.grid(False)
     axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="m")
     style.title(axis, panel.title)
@@ -185,7 +181,7 @@ def _draw(axis: Axes, panel: Moments, place: _Place) -> None:
 
 
 def add_body(axis: Axes, mesh: Mesh, *, pale: float = 0.0, zorder: int = 2) -> Callable[..., None]:
-    """Adds a body to axes; returns the function (positions [n, dim], offset [2]) that draws it.
+    """Adds a body to axes; returns the function (positions [n, dim], drop) that draws it, lowered by `drop`.
 
     In the plane its triangles are drawn; in space the lit faces of its skin that face the viewer, the farthest first.
     `pale` is the share of white in its colours.
@@ -197,8 +193,8 @@ def add_body(axis: Axes, mesh: Mesh, *, pale: float = 0.0, zorder: int = 2) -> C
     axis.add_collection(body)
     axis.add_collection(outline)
 
-    def show(x: np.ndarray, offset: np.ndarray | float = 0.0) -> None:
-        points, faces, light = flattened(x) + offset, mesh.elements, np.ones(1)
+    def show(x: np.ndarray, drop: float = 0.0) -> None:
+        points, faces, light = _lowered(flattened(x), drop), mesh.elements, np.ones(1)
         if plane:
             outline.set_segments(list(points[skin]))
         else:
@@ -214,9 +210,9 @@ def add_body(axis: Axes, mesh: Mesh, *, pale: float = 0.0, zorder: int = 2) -> C
     return show
 
 
-def straight_ground(ends: tuple[float, float], level: float, slope: float) -> Float[np.ndarray, "2 2"]:
-    """Returns the line y = level + slope x between two values of x."""
-    return np.stack([np.array(ends), level + slope * np.array(ends)], axis=1)
+def straight_ground(x: np.ndarray, level: float, slope: float) -> Float[np.ndarray, "g 2"]:
+    """Returns the points of the line y = level + slope x."""
+    return np.stack([x, level + slope * x], axis=1)
 
 
 def draw_ground(axis: Axes, line: Float[np.ndarray, "g 2"], *, depth: float) -> None:
@@ -239,45 +235,6 @@ def flattened(positions: Float[np.ndarray, "*k dim"]) -> Float[np.ndarray, "*k 2
     return positions if positions.shape[-1] == 2 else np.stack([positions @ _RIGHT, positions @ _UP], axis=-1)
 
 
-def write_soft_body_gif(
-    path: Path,
-    mesh: Mesh,
-    positions: Float[np.ndarray, "T n dim"],
-    t: Float[np.ndarray, " times"],
-    *,
-    muscles: Any = None,
-    actuation: Float[np.ndarray, "times k"] | None = None,
-    ground: float | np.ndarray | None = 0.0,
-    slope: float = 0.0,
-    title: str = "",
-    stride: int = 1,
-    frames_per_second: float = 15.0,
-) -> None:
-    """Writes a motion with the outline of its first frame, the ground, axes in m, and the time.
-
-    Args:
-        mesh: mesh to draw; in space only its skin, with axis 2 pointing up.
-        positions: positions of the vertices, m.
-        t: time of every frame, s.
-        muscles: pairs of vertices [k, 2], drawn as lines (in the plane).
-        actuation: length of the muscles in every frame relative to their rest length; red is short.
-        ground: height of the ground at x = 0, m, or in the plane the points [g, 2] of its line; `None` for none.
-        slope: slope of the ground (in the plane).
-        stride: frames of the motion per frame of the GIF.
-        frames_per_second: frame rate of the GIF.
-
-    Raises:
-        InputError: times, vertices or muscles do not fit the positions, or there is no frame.
-    """
-    require_positive(stride=stride, frames_per_second=frames_per_second)
-    if len(t) != len(positions):
-        raise InputError(f"there are {len(t)} times for {len(positions)} frames; expected one for each")
-    options = {"muscles": muscles, "actuation": actuation, "ground": ground, "slope": slope}
-    figure, show = soft_body_drawing(mesh, positions, **options)
-    frames = range(0, len(t), stride)
-    write_gif(path, figure, show, t, frames=frames, frames_per_second=frames_per_second, title=title)
-
-
 def soft_body_drawing(
     mesh: Mesh,
     positions: Float[np.ndarray, "T n dim"],
@@ -287,49 +244,54 @@ def soft_body_drawing(
     ground: float | np.ndarray | None = 0.0,
     slope: float = 0.0,
 ) -> tuple[Figure, Callable[[int], None]]:
-    """Returns a figure with the ground and axes that hold all frames, and the function that draws a frame in it.
+    """Returns a figure with axes that hold all frames, and the function that draws a frame in it, for `write_gif`.
 
-    Arguments are those of `write_soft_body_gif`.
+    The figure shows the ground, and in the plane the outline of the first frame.
+
+    Args:
+        mesh: mesh to draw; in space only its skin, with axis 2 pointing up.
+        positions: positions of the vertices, m.
+        muscles: pairs of vertices [k, 2], drawn as lines (in the plane).
+        actuation: length of the muscles in every frame relative to their rest length; red is short.
+        ground: height of the ground at x = 0, m, or in the plane the points [g, 2] of its line; `None` for none.
+        slope: slope of the ground (in the plane).
 
     Raises:
         InputError: vertices or muscles do not fit the positions, or there is no frame.
     """
-    positions = np.asarray(positions)
-    shape = mesh.vertices.shape
-    if positions.ndim != 3 or positions.shape[1:] != shape or len(positions) == 0:
-        raise InputError(f"positions have shape {list(positions.shape)}; expected [T, {shape[0]}, {shape[1]}], T > 0")
-    expected = (len(positions), 0 if muscles is None else len(muscles))
-    if actuation is not None and np.shape(actuation) != expected:
-        raise InputError(f"actuation has shape {list(np.shape(actuation))}; expected {list(expected)}")
+    positions = _fitting("positions", positions, mesh)
+    pairs = np.zeros((0, 2), int) if muscles is None else np.asarray(muscles)
+    expected = (len(positions), len(pairs))
+    lengths = np.ones(expected) if actuation is None else np.asarray(actuation)
+    if lengths.shape != expected:
+        raise InputError(f"actuation has shape {list(lengths.shape)}; expected {list(expected)}")
     points, plane = flattened(positions), mesh.dimension == 2
     below = floor(positions, ground) if isinstance(ground, int | float) and not plane else np.zeros((0, 2))
     every = np.concatenate([points.reshape(-1, 2), below])
     low, high = np.nanmin(every, axis=0), np.nanmax(every, axis=0)
     margin = 0.06 * max(high - low)
-    low[0], high[0] = low[0] - margin, high[0] + margin
-    line = np.zeros((0, 2))
+    ends = np.array([low[0] - margin, high[0] + margin])
     if plane and ground is not None:
-        flat = not isinstance(ground, np.ndarray)
-        line = straight_ground((low[0], high[0]), ground, slope) if flat else ground
-        low[1] = min(low[1], line[:, 1].min())
-    low[1], high[1] = low[1] - margin, high[1] + margin
-    height = float(np.clip(style.WIDTH * (high[1] - low[1]) / (high[0] - low[0]), 0.9, 5.4))
-    figure, [[axis]] = style.figure(height=height + 1.2, dpi=DPI)
-    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+        below = ground if isinstance(ground, np.ndarray) else straight_ground(ends, ground, slope)
+        low[1] = min(low[1], below[:, 1].min())
+    bottom, top = low[1] - margin, high[1] + margin
+    wide, high = np.ptp(ends), top - bottom
+    figure, [[axis]] = style.figure(height=float(np.clip(style.WIDTH * high / wide, 0.9, 5.4)) + 1.2, dpi=DPI)
+    axis.set(xlim=ends, ylim=(bottom, top), aspect="equal")
     axis.set(xlabel="x, m" if plane else "m", ylabel="y, m" if plane else "m")
     axis.grid(False)
     axis.yaxis.set_major_locator(MaxNLocator(4))
     if plane:
         if ground is not None:
-            draw_ground(axis, line, depth=float(np.ptp([low, high], axis=0).sum()))
+            draw_ground(axis, below, depth=wide + high)
         axis.add_collection(LineCollection(list(points[0][boundary(mesh)]), colors="0.8", linewidths=1.0, zorder=1))
-    elif ground is not None:
+    else:
         axis.fill(*below.T, color=GROUND, zorder=0)
     show_body = add_body(axis, mesh)
-    pairs = np.asarray(muscles) if plane and muscles is not None else np.zeros((0, 2), int)
     lines = LineCollection([], linewidths=3.0, zorder=4, capstyle="round", cmap=_ACTUATION, norm=_ACTUATED)
     axis.add_collection(lines)
-    if len(pairs) and actuation is not None:
+    drawn = plane and len(pairs) > 0
+    if drawn and actuation is not None:
         bar = figure.colorbar(ScalarMappable(_ACTUATED, _ACTUATION), ax=axis, shrink=0.8, aspect=10, pad=0.01)
         bar.set_ticks([0.25, 1])
         bar.ax.tick_params(labelsize=style.SMALL)
@@ -337,8 +299,8 @@ def soft_body_drawing(
 
     def show(frame: int) -> None:
         show_body(positions[frame])
-        if len(pairs):
+        if drawn:
             lines.set_segments(list(points[frame][pairs]))
-            lines.set_array(np.ones(len(pairs)) if actuation is None else np.asarray(actuation[frame]))
+            lines.set_array(lengths[frame])
 
     return figure, show

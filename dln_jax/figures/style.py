@@ -102,6 +102,12 @@ def legend_beside(figure: Figure, axis: Axes, *, columns: int, place: str = "out
     legend(figure, handles, labels, loc=place, ncols=min(columns, len(labels)))
 
 
+def separate(axis: Axes, places: Iterable[float]) -> None:
+    """Draws thin vertical lines between motions."""
+    for place in places:
+        axis.axvline(place, color="0.75", linewidth=0.8, zorder=0)
+
+
 def scale_of(values: Iterable[float | int]) -> str:
     """Returns "log" for positive values that span a decade or more, else "linear"."""
     numbers = np.asarray(list(values), float)

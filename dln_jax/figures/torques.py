@@ -42,61 +42,54 @@ def force_decomposition(
     `data` is the test set, `predicted` [N, d] by the keys of `PARTS`; the model's name sets the colour, and
     the legend adds a note to it.
     """
-    shown = np.unique(data.trajectory)[:MOST_MOTIONS]
-    samples = np.flatnonzero(np.isin(data.trajectory, shown))
+    samples = np.flatnonzero(np.isin(data.trajectory, np.unique(data.trajectory)[:MOST_MOTIONS]))
     trajectory, joints = data.trajectory[samples], min(data.degrees_of_freedom, MOST_JOINTS)
-    starts = np.flatnonzero(np.r_[True, np.diff(trajectory) != 0])
-    moving = len(samples) > 2 * len(shown)
-    x = _running_time(data.t[samples], starts) if moving else np.arange(len(samples), dtype=float)
-    truths = {key: truth[samples] for key in PARTS if (truth := getattr(data, key)) is not None}
-    errors = {key: predicted[key][samples] - truth for key, truth in truths.items()}
-    largest = max((float(np.abs(error[:, :joints]).max()) for error in errors.values()), default=0.0)
+    starts = np.flatnonzero(np.diff(trajectory, prepend=-1))
+    moving = len(samples) > 2 * len(starts)
+    x = np.arange(len(samples), dtype=float)
+    if moving:  # motions are joined at the median spacing of their samples
+        steps = np.diff(data.t[samples], prepend=data.t[samples[0]])
+        steps[starts[1:]] = np.median(np.delete(steps, starts))
+        x = np.cumsum(steps)
+    of_truth, of_model, of_errors = ("-", "--", "-") if moving else ("o", ".-", ".")
+    modelled = {key: predicted[key][samples, :joints] for key in PARTS}
+    truths = {key: truth[samples, :joints] for key in PARTS if (truth := getattr(data, key)) is not None}
+    errors = {key: modelled[key] - truth for key, truth in truths.items()}
+    largest = float(np.max(np.abs(list(errors.values())), initial=0.0))
     factor, prefix = style.prefixed(largest, "")
     rows = [(key, is_error) for key in PARTS for is_error in (False, True) if not is_error or key in errors]
     heights = [LOW if is_error else HIGH for _, is_error in rows]
     figure, axes = style.figure(len(rows), joints, height=sum(heights) + 0.9, sharex=True, height_ratios=heights)
     figure.get_layout_engine().set(h_pad=0.02, hspace=0.0)  # type: ignore[union-attr]
-    shade, dash, dot = style.colour(model), "--" if moving else "", "" if moving else "."
+    shade, units = style.colour(model), [style.unit_of(data, joint) for joint in range(joints)]
     for line, (key, is_error) in zip(axes, rows, strict=True):
         for joint, axis in enumerate(line):
             if is_error:
-                axis.plot(x, errors[key][:, joint] / factor, "-" if moving else ".", color=shade, linewidth=0.9)
+                axis.plot(x, errors[key][:, joint] / factor, of_errors, color=shade, linewidth=0.9)
                 axis.set_ylim(-1.15 * largest / factor, 1.15 * largest / factor)
             else:
                 if key in truths:
-                    look = {"color": "black", "linewidth": 2.0, "markersize": 4, "label": "truth"}
-                    axis.plot(x, truths[key][:, joint], "-" if moving else "o", **look)
-                axis.plot(
-                    x, predicted[key][samples, joint], dash, marker=dot, color=shade, linewidth=1.3, label=model + note
-                )
-                low, high = axis.get_ylim()
-                if high - low < ROUNDING * np.ptp(predicted["tau"][samples, joint]):  # a part that is zero
+                    truth = truths[key][:, joint]
+                    axis.plot(x, truth, of_truth, color="black", linewidth=2.0, markersize=4, label="truth")
+                axis.plot(x, modelled[key][:, joint], of_model, color=shade, linewidth=1.3, label=model + note)
+                if np.ptp(axis.get_ylim()) < ROUNDING * np.ptp(modelled["tau"][:, joint]):  # a part that is zero
                     axis.set_ylim(-1.0, 1.0)
             axis.margins(x=0.01)
             axis.tick_params(axis="x", bottom=line is axes[-1])
-            for start in starts[1:]:
-                axis.axvline((x[start - 1] + x[start]) / 2, color="0.75", linewidth=0.8, zorder=0)
-        unit = style.unit_of(data, 0)
-        line[0].set_ylabel(f"error,\n{prefix}{unit}" if is_error else f"{PARTS[key]},\n{unit}")
-    names = [str(data.label[index]) for index in trajectory[starts]]
+            style.separate(axis, (x[starts[1:] - 1] + x[starts[1:]]) / 2)
+        line[0].set_ylabel(f"error,\n{prefix}{units[0]}" if is_error else f"{PARTS[key]},\n{units[0]}")
     time = "time, s (test motions in turn)" if joints < 3 and len(starts) > 1 else "time, s"
     for joint, (top, bottom) in enumerate(zip(axes[0], axes[-1], strict=True)):
-        unit = style.unit_of(data, joint)
-        style.title(top, f"joint {joint + 1}" + (f" ({unit})" if unit != style.unit_of(data, 0) else ""), pad=16)
-        for start, end, name in zip(starts, [*starts[1:], len(x)], names, strict=True):
+        unit = "" if units[joint] == units[0] else f" ({units[joint]})"
+        style.title(top, f"joint {joint + 1}{unit}", pad=16)
+        for start, end in itertools.pairwise([*starts, len(x)]):
+            name = str(data.label[trajectory[start]])
             place, size = ((x[start] + x[end - 1]) / 2, 1.04), style.SMALL if len(name) < 4 else 6.5
             top.annotate(name, place, xycoords=("data", "axes fraction"), ha="center", fontsize=size, color="0.35")
         bottom.set_xlabel(time if moving else "test state")
     figure.align_ylabels(axes[:, 0])
     style.legend_beside(figure, axes[0, 0], columns=2)
     return figure
-
-
-def _running_time(t: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Returns a continuous time of motions, joined at the median spacing of their samples."""
-    steps = np.diff(t, prepend=t[0])
-    steps[starts[1:]] = np.median(np.delete(steps, starts))
-    return np.cumsum(steps)
 
 
 def torque_by_joint(
@@ -155,18 +148,17 @@ def torque_bands(
     within = np.maximum(np.quantile(bands, 0.98, axis=0), np.quantile(np.abs(error[shown]), 0.995, axis=0))
     # One unit for all joints, so that their errors can be compared.
     factor, prefix = style.prefixed(float(within[:d].max()), "")
-    starts = np.flatnonzero(np.diff(data.trajectory[shown])) + 0.5
+    breaks = np.flatnonzero(np.diff(data.trajectory[shown])) + 0.5
     for joint, axis in enumerate(axes):
         band, largest = bands[:, joint] / factor, 1.1 * within[joint] / factor
-        look = {"color": style.colour(model), "alpha": 0.25, "linewidth": 0}
-        axis.fill_between(shown, -band, band, **look, label="95 % band")
+        shade = style.colour(model)
+        axis.fill_between(shown, -band, band, color=shade, alpha=0.25, linewidth=0, label="95 % band")
         axis.plot(shown, error[shown, joint] / factor, color="black", linewidth=0.8, label="predicted minus measured")
         axis.set_ylim(-largest, largest)
         flagged = np.repeat(out_of_distribution[shown], 2)
         edges = (shown[:, None] + [-0.5, 0.5]).ravel()
         axis.fill_between(edges, -largest, largest, where=flagged, color="0.5", alpha=0.25, linewidth=0)
-        for start in starts:
-            axis.axvline(start, color="0.75", linewidth=0.8, zorder=0)
+        style.separate(axis, breaks)
         axis.set_ylabel(f"joint {joint + 1},\n{prefix}{style.unit_of(data, joint)}")
         axis.tick_params(axis="x", labelbottom=joint == d - 1)
         axis.margins(x=0.01)
@@ -198,17 +190,18 @@ def tip_paths(
         motions: rollouts from the test's first states under its torques, or none; drawn as long as they are valid.
         model: name of the model, which sets the colour.
     """
-    shown = list(np.unique(test.trajectory))[:MOST_PATHS]
+    shown = np.unique(test.trajectory)[:MOST_PATHS]
     columns = min(len(shown), 4)
     rows = -(-len(shown) // columns)
     figure, axes = style.figure(rows, columns, height=2.3 * rows + 0.55, sharex=True, sharey=True)
-    places = jax.jit(jax.vmap(tip))
+    places, shade = jax.jit(jax.vmap(tip)), style.colour(model)
     positions = np.asarray(places(data.q))
     training = [positions[data.trajectory == index] for index in np.setdiff1d(data.trajectory, test.trajectory)]
-    times, paths = np.zeros(0), []
+    predicted = []
     if motions:
-        times, ends = valid_prediction_times(test, list(motions)), np.cumsum([len(motion.q) for motion in motions])
+        ends = np.cumsum([len(motion.q) for motion in motions])
         paths = np.split(np.asarray(places(np.concatenate([motion.q for motion in motions]))), ends[:-1])
+        predicted = list(zip(valid_prediction_times(test, list(motions)), paths, strict=True))
     for axis in axes.flat:
         axis.set_aspect("equal")
         axis.axis("off")
@@ -217,14 +210,15 @@ def tip_paths(
         axis.add_collection(LineCollection(training[:MOST_PATHS], colors="0.94", linewidths=6, capstyle="round"))
         axis.plot(*positions[chosen].T, color="black", linewidth=2.2)
         title = f"{data.label[index]} (test)"
-        if number < len(times):
-            t = data.t[chosen]
-            path = paths[number][t - t[0] <= times[number] + 1e-9]
-            axis.plot(*path.T, "--", color=style.colour(model), linewidth=1.3)
-            axis.plot(*path[-1], "o", color=style.colour(model), markersize=4)
-            title = f"{data.label[index]}: valid for {times[number]:.1f} of {t[-1] - t[0]:.1f} s"
+        if number < len(predicted):
+            valid, path = predicted[number]
+            t = data.t[chosen] - data.t[chosen][0]
+            path = path[t <= valid + 1e-9]
+            axis.plot(*path.T, "--", color=shade, linewidth=1.3)
+            axis.plot(*path[-1], "o", color=shade, markersize=4)
+            title = f"{data.label[index]}: valid for {valid:.1f} of {t[-1]:.1f} s"
         style.title(axis, title, fontsize=style.SMALL)
-    if len(times):
+    if predicted:
         caption = f"black: test; dashed: {model} driven by its torques until the prediction fails; grey: training"
         figure.supxlabel(caption, fontsize=style.SMALL)
     return figure
@@ -247,36 +241,35 @@ def friction_curves(
             hundredth may lie out of view.
         rate_unit, force_unit: one unit for all joints, or one per joint.
     """
-    arrays = {name: (np.asarray(rates), np.asarray(forces)) for name, (rates, forces) in curves.items()}
-    d = next(iter(arrays.values()))[0].shape[1]
-    rate_units, force_units = np.broadcast_to(rate_unit, d), np.broadcast_to(force_unit, d)
-    alike = len({*zip(rate_units, force_units, strict=True)}) == 1
+    colours, d = style.colours_of(curves), np.shape(next(iter(curves.values()))[0])[1]
+    units = list(zip(np.broadcast_to(rate_unit, d), np.broadcast_to(force_unit, d), strict=True))
+    alike = len({*units}) == 1
     columns = min(d, MOST_COLUMNS)
     rows = -(-d // columns)
     figure, axes = style.figure(rows, columns, height=0.6 + 2.4 * rows)
     for axis in axes.flat[d:]:
         axis.set_visible(False)
     for joint, axis in enumerate(axes.flat[:d]):
+        drawn = {name: tuple(np.asarray(values)[:, joint] for values in curve) for name, curve in curves.items()}
         if measured is not None:
             rates, forces = (np.asarray(values)[:, joint] for values in measured)
-            every = slice(None, None, -(-len(rates) // MOST_SAMPLES))
+            every = -(-len(rates) // MOST_SAMPLES)
             points = {"color": style.REFERENCE, "markersize": 1.5, "rasterized": True, "label": "measured"}
-            axis.plot(rates[every], forces[every], ".", **points)
-            seen = [np.percentile(forces, [0.5, 99.5]), *(forces[:, joint] for _, forces in arrays.values())]
-            low, high = float(min(map(np.min, seen))), float(max(map(np.max, seen)))
-            room = 0.1 * (high - low) or 1.0
-            axis.set_ylim(low - room, high + room)
-        for colour, (name, (rates, forces)) in zip(itertools.cycle(style.CYCLE), arrays.items(), strict=False):
-            order = np.argsort(rates[:, joint])
-            axis.plot(rates[order, joint], forces[order, joint], color=colour, linewidth=1.3, label=name)
+            axis.plot(rates[::every], forces[::every], ".", **points)
+            seen = np.concatenate([np.percentile(forces, [0.5, 99.5]), *(forces for _, forces in drawn.values())])
+            room = 0.1 * np.ptp(seen) or 1.0
+            axis.set_ylim(seen.min() - room, seen.max() + room)
+        for name, (rates, forces) in drawn.items():
+            order = np.argsort(rates)
+            axis.plot(rates[order], forces[order], color=colours[name], linewidth=1.3, label=name)
         axis.axhline(0, color="black", linewidth=0.5)
         axis.locator_params(axis="x", nbins=5)
         if d > 1:
             style.title(axis, names[joint] if names else f"joint {joint + 1}")
         if joint >= d - columns or not alike:
-            axis.set_xlabel(f"rate, {rate_units[joint]}")
+            axis.set_xlabel(f"rate, {units[joint][0]}")
         if joint % columns == 0 or not alike:
-            axis.set_ylabel(f"friction, {force_units[joint]}")
+            axis.set_ylabel(f"friction, {units[joint][1]}")
     style.legend_beside(figure, axes[0, 0], columns=4)
     return figure
 
@@ -301,24 +294,23 @@ def excitation_figure(
         for joint, axis in enumerate(line):
             for index, name in enumerate(data.label):
                 samples = data.trajectory == index
-                look = {"color": colours[name], "linewidth": 0.8, "label": str(name)}
-                axis.plot(data.t[samples], getattr(data, key)[samples, joint], **look)
-            for bound in limits[key][joint]:
-                if np.isfinite(bound):
-                    axis.axhline(bound, color=style.REFERENCE, linestyle="--", linewidth=0.9)
+                values = getattr(data, key)[samples, joint]
+                axis.plot(data.t[samples], values, color=colours[name], linewidth=0.8, label=str(name))
+            for bound in filter(np.isfinite, limits[key][joint]):
+                axis.axhline(bound, color=style.REFERENCE, linestyle="--", linewidth=0.9)
             axis.tick_params(labelsize=6.5)
         line[0].set_ylabel(f"{quantity}, {style.unit_of(data, 0, key)}")
-    for joint in range(joints):
-        unit = style.unit_of(data, joint, "q")
-        differs = "" if unit == style.unit_of(data, 0, "q") else f" ({unit})"
-        style.title(axes[0, joint], f"{names[joint]:.12}{differs}", fontsize=style.SMALL)
-        axes[-1, joint].set_xlabel("time, s", fontsize=style.SMALL)
+    units = [style.unit_of(data, joint, "q") for joint in range(joints)]
+    for unit, name, column in zip(units, names, axes.T, strict=False):
+        differs = "" if unit == units[0] else f" ({unit})"
+        style.title(column[0], f"{name:.12}{differs}", fontsize=style.SMALL)
+        column[-1].set_xlabel("time, s", fontsize=style.SMALL)
     for place, (name, values) in enumerate(conditions.items()):
         shade = style.REFERENCE if name == "random" else style.BLUE
-        below.plot(values, np.full(len(values), place), "o", color=shade, markersize=4, alpha=0.8)
+        below.plot(values, [place] * len(values), "o", color=shade, markersize=4, alpha=0.8)
     below.set_yticks(range(len(conditions)), list(conditions))
-    below.set_ylim(len(conditions) - 0.5, -0.5)
-    below.set_xscale(style.scale_of(itertools.chain(*conditions.values())))
-    below.set_xlabel("condition of the regressor, columns of unit length")
+    scale = style.scale_of(itertools.chain(*conditions.values()))
+    label = "condition of the regressor, columns of unit length"
+    below.set(ylim=(len(conditions) - 0.5, -0.5), xscale=scale, xlabel=label)
     style.legend_beside(figure, axes[0, 0], columns=6)
     return figure

@@ -36,7 +36,7 @@ from dln_jax.learning.engine.problem import (
     unmonitored,
 )
 from dln_jax.learning.select import Trial, select
-from dln_jax.nn import differential_mlp, ensembles
+from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers
 from dln_jax.precision import data_type
@@ -140,7 +140,7 @@ def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
     """Builds an ensemble's problem: the sum of its members' losses, or for Gauss-Newton members as seeds."""
     ours, theirs = (targets(data, network) for data in sets)
     sizes = (sets.train.inputs, *(network.width,) * network.depth, sets.train.outputs)
-    layers = ensembles.init(
+    layers = differential_mlp.init_ensemble(
         jax.random.key(network.seed), sizes, members=network.members, dtype=data_type(network.precision)
     )
     function = activation(network.activation)

@@ -1,4 +1,4 @@
-"""Networks for inverse and forward dynamics, and for the rates of a phase space.
+"""Networks for inverse and forward dynamics, for the rates of a phase space, and for functions of x.
 
     tau = tau_scale network([features(q), qd / rate_scale, qdd / acceleration_scale])
     qdd = acceleration_scale network([features(q), qd / rate_scale, tau / tau_scale])
@@ -12,18 +12,27 @@ The last one is a Helmholtz decomposition, published in the same paper with the 
 solenoidal part J grad H has no divergence and conserves H; the conservative part grad F has no rotation. H and F are
 networks of [features(q), p / momentum_scale]. F can represent friction without a Rayleigh function of (q, qd): for a
 damped spring it is F = -½ c p². Fields without divergence and rotation may be in either part.
+
+A differential network, or an ensemble of them, is a function of x with its Jacobian and Hessian.
 """
 
+from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import Array
 from jax.typing import DTypeLike
+from jaxtyping import Float
 
+from dln_jax.mechanics.arguments import vectors
 from dln_jax.mechanics.dynamics import InverseForward, PhaseRates
 from dln_jax.models.model import Model, Scale, inputs_of, model_of, per_coordinate, perceptrons, unsaturated
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.types import InputError, Needs, Scalar, Vector
+from dln_jax.nn.differential_mlp import Layers, init_ensemble, layer_shapes, value_jacobian_and_hessian
+from dln_jax.sizes import require_network
+from dln_jax.types import InputError, Needs, Scalar, Vector, VectorLike, require_positive
 
 FIELDS = ("solenoidal", "conservative", "both")
 
@@ -60,7 +69,7 @@ def make_feed_forward(
         "inverse_dynamics": partial(network, "inverse", accelerations, forces),
         "forward_dynamics": partial(network, "forward", forces, accelerations),
     }
-    return model_of(InverseForward, lambda: terms, needs.degrees_of_freedom, dtype)
+    return model_of(InverseForward, lambda: terms, needs, dtype)
 
 
 def make_phase_network(
@@ -91,7 +100,7 @@ def make_phase_network(
         )
         return outputs[:d], outputs[d:]
 
-    return model_of(PhaseRates, lambda: {"rates": network}, d, dtype)
+    return model_of(PhaseRates, lambda: {"rates": network}, needs, dtype)
 
 
 def make_helmholtz(
@@ -139,4 +148,48 @@ def make_helmholtz(
         "hamiltonian": None if field == "conservative" else partial(scalar, "hamiltonian"),
         "potential": None if field == "solenoidal" else partial(scalar, "potential"),
     }
-    return model_of(record, lambda: terms, needs.degrees_of_freedom, dtype)
+    return model_of(record, lambda: terms, needs, dtype)
+
+
+class Derivatives(NamedTuple):
+    """Derivatives at one x [n]; for an ensemble, means over its members."""
+
+    value: Float[Array, "m"]
+    jacobian: Float[Array, "m n"]
+    hessian: Float[Array, "m n n"]
+
+
+class FunctionModel(NamedTuple):
+    """A parametric function of x."""
+
+    init: Callable[[Array], Layers]
+    """Random key -> layers, with ensemble members on the leading axis, even for one member."""
+    derivatives: Callable[[Layers], Callable[[VectorLike], Derivatives]]
+    """Layers -> function of x [n], which checks its argument."""
+
+
+def make_differential_network(
+    *, sizes: tuple[int, ...], activation: Activation, members: int, dtype: DTypeLike = jnp.float32
+) -> FunctionModel:
+    """Makes the model of `nn.differential_mlp`.
+
+    Args:
+        sizes: (inputs n, hidden widths ..., outputs m).
+        members: number of networks in the ensemble.
+
+    Raises:
+        InputError: invalid sizes, too large a network, or no members.
+    """
+    require_positive(members=members)
+    layer_shapes(sizes)
+    require_network(width=max(sizes), depth=max(len(sizes) - 2, 1))
+
+    def derivatives(layers: Layers) -> Callable[[VectorLike], Derivatives]:
+        def function(x):
+            (inputs,) = vectors(sizes[0], x=x)
+            every = jax.vmap(lambda member: value_jacobian_and_hessian(member, inputs, activation=activation))(layers)
+            return Derivatives(*(array.mean(axis=0) for array in every))
+
+        return function
+
+    return FunctionModel(lambda key: init_ensemble(key, sizes, members=members, dtype=dtype), derivatives)

@@ -1,10 +1,11 @@
-"""Hamiltonian neural networks, structured, black-box and separable, their dissipation, and bodies in pairs.
+"""Hamiltonian models: neural networks of three kinds, their dissipation, bodies in pairs, and polynomials.
 
     structured:   H = ½ |L(q)ᵀ p|² + V(q),  M⁻¹ = L Lᵀ,  diag L = softplus(x + shift) + floor
     black-box:    H = network([features(q), p / momentum_scale])
     separable:    H = T(p / momentum_scale) + V(features(q)), with two networks
     dissipative:  D = ½ sum_j c_j(q) qd_j²,   c = softplus(network(features(q))) > 0,   dH/dt = -2 D <= 0
     pairwise:     H = sum_i |p_i|² / (2 m_i) + sum over pairs of U(r_ij),   U(r) = w·f(r) + network(f(r))
+    polynomial:   H = sum_k c_k phi_k(q, p)
 
 The black-box model is that of Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks". The structured one
 follows Lutter and Peters 2021, with a network for the inverse mass matrix, and the separable one Chen et al. 2020,
@@ -14,18 +15,22 @@ steps (`mechanics.integrators.stormer_verlet`) apply to it. It fits systems whos
 `mechanics.equations.flow` turns all of them into Hamilton's equations, and `dynamics` into equations in velocities.
 
 In the pairwise model, q and p hold one body after the other, [bodies * dimension], or with `order="axes"` one axis
-after the other (x1, x2, .., y1, y2, ..), as in many published files. H depends only on distances: it is invariant under
-translation, rotation and reflection, so total momentum and angular momentum are conserved for any parameters. It is
-also invariant under exchange of identical bodies.
+after the other (x1, x2, .., y1, y2, ..), as in many published files. H depends only on distances, so total momentum and
+angular momentum are conserved for any parameters; identical bodies may be exchanged.
 
 The features f of r, in units of `distance_scale`, are r, 1/r and log r by default: the potentials of a constant force
 and of Newton's and Coulomb's law, in space and in the plane. Their linear term w·f is exact for these laws and does not
-saturate as bodies approach, unlike a bounded activation; the network learns the rest. To assume none of these laws,
-leave their features out.
+saturate as bodies approach; the network learns the rest. To assume none of these laws, leave their features out. At
+r = 0 the energy (with 1/r or log r) and its derivative are not finite: there is no softening.
 
-At r = 0 the energy (with 1/r or log r) and its derivative are not finite: there is no softening.
+The phi_k of the polynomial model are all products, up to a total degree, of powers of p_j, of powers of the
+displacements of prismatic joints, and of cos(n q_j) and sin(n q_j), of degree n, for revolute joints. No motion shows
+the constant, so it is left out. Hamilton's equations are linear in c: linear least squares identifies c from the rates
+of states (`learning.matching.match_linear`). The number of terms grows exponentially with the coordinates.
 """
 
+import itertools
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -75,7 +80,7 @@ def make_structured_hamiltonian(
     """
     networks = perceptrons(width, depth, activation)
     terms = partial(structured_terms, needs, networks, "inverse_factor", diagonal_shift, diagonal_floor)
-    return model_of(NaturalHamiltonian, terms, needs.degrees_of_freedom, dtype)
+    return model_of(NaturalHamiltonian, terms, needs, dtype)
 
 
 def make_black_box_hamiltonian(
@@ -105,7 +110,7 @@ def make_black_box_hamiltonian(
     momenta = per_coordinate(needs, "momentum_scale", momentum_scale)
     terms = partial(black_box_terms, needs, perceptrons(width, depth, activation), "hamiltonian", momenta)
     record = partial(HamiltonianSystem, iterations=iterations, initial_guess=initial_guess)
-    return model_of(record, terms, needs.degrees_of_freedom, dtype)
+    return model_of(record, terms, needs, dtype)
 
 
 def make_separable_hamiltonian(
@@ -144,7 +149,7 @@ def make_separable_hamiltonian(
         "potential": potential if needs.gravity else None,
         "dissipation": viscous_dissipation if needs.friction else None,
     }
-    return model_of(energies, lambda: terms, needs.degrees_of_freedom, dtype)
+    return model_of(energies, lambda: terms, needs, dtype)
 
 
 def make_dissipative(
@@ -261,4 +266,60 @@ def make_pairwise_hamiltonian(
         return jnp.diag(jnp.repeat(factors, dimension) if order == "bodies" else jnp.tile(factors, dimension))
 
     terms = {"potential": potential, "inverse_factor": inverse_factor}
-    return model_of(NaturalHamiltonian, lambda: terms, needs.degrees_of_freedom, dtype)
+    return model_of(NaturalHamiltonian, lambda: terms, needs, dtype)
+
+
+MOST_TERMS = 5_000
+"""Largest number of terms of the energy; the fit's cost grows with its square."""
+
+
+def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLike = jnp.float32) -> Model:
+    """Returns the (init, energies) pair; the parameters are the vector c, initially zero.
+
+    Args:
+        needs: needs of the scene. Friction is refused, because it would not be linear in c.
+        degree: the largest total degree of a term.
+
+    Raises:
+        InputError: the scene has friction, the degree is below 2, or there are more than `MOST_TERMS` terms.
+    """
+    if needs.friction or needs.joint_friction:
+        raise InputError(
+            "the polynomial Hamiltonian conserves energy; take a dissipative model for needs with friction"
+        )
+    if degree < 2:
+        raise InputError(f"degree is {degree}; expected at least 2, since kinetic energy is quadratic in p")
+    d = needs.degrees_of_freedom
+    # Degrees of the functions of one variable, in the order of their table: 1, then x^n, or cos nx and sin nx.
+    powers = list(range(degree + 1))
+    harmonics = [(place + 1) // 2 for place in range(2 * degree + 1)]
+    choices = [harmonics if joint == "revolute" else powers for joint in needs.joints] + [powers] * d
+    most = math.prod(map(len, choices))
+    if most > MOST_TERMS * 100:
+        raise InputError(f"{d} coordinates to degree {degree} make too many terms; lower the degree")
+    terms = np.array(
+        [
+            [place for place, _ in term]
+            for term in itertools.product(*map(enumerate, choices))
+            if 0 < sum(order for _, order in term) <= degree
+        ]
+    )
+    if len(terms) > MOST_TERMS:
+        raise InputError(f"degree {degree} makes {len(terms)} terms; the limit is {MOST_TERMS}: lower the degree")
+
+    def table(revolute: bool, x: Scalar) -> Float[Array, " functions"]:
+        orders = range(1, degree + 1)
+        values = [wave(n * x) for n in orders for wave in (jnp.cos, jnp.sin)] if revolute else [x**n for n in orders]
+        return jnp.stack([jnp.ones_like(x), *values])
+
+    def values(q: Vector, p: Vector) -> Float[Array, " terms"]:
+        product = jnp.ones(len(terms), p.dtype)
+        for j in range(d):
+            product *= table(needs.joints[j] == "revolute", q[j])[terms[:, j]]
+            product *= table(False, p[j])[terms[:, d + j]]
+        return product
+
+    def energies(parameters: Array) -> HamiltonianSystem:
+        return HamiltonianSystem(lambda q, p: jnp.dot(parameters, values(q, p)))
+
+    return Model(init=lambda key: jnp.zeros(len(terms), dtype), energies=energies)

@@ -106,11 +106,25 @@ def make_image_model(
     size: dict[str, Any] = {"width": field_width, "depth": field_depth, "activation": field_activation}
     # Explicit, so that a change of their defaults does not change stored models.
     size |= {"momentum_scale": 1.0, "dtype": dtype}
-    if field == "black-box-hnn":
-        unit, slowed = make_black_box_hamiltonian(NEEDS, **size), _slowed_energy
-    else:
-        unit, slowed = make_phase_network(NEEDS, **size, rate_scale=1.0), _slowed_rates
-    dynamics = Model(unit.init, lambda parameters: slowed(unit.energies(parameters), momentum_scale))
+    has_energy = field == "black-box-hnn"
+    unit = (
+        make_black_box_hamiltonian(NEEDS, **size) if has_energy else make_phase_network(NEEDS, **size, rate_scale=1.0)
+    )
+
+    # States and rates of the unit model are of order 1; its motions take 1 / rate frames per unit of its time. With
+    # P = p / rate: (q, p)' = (rate Q'(q, P), rate² P'(q, P)), and for an energy H0(q, P), H = rate² H0.
+    def slowed(parameters: Any) -> HamiltonianSystem | PhaseRates:
+        system, rate = unit.energies(parameters), momentum_scale
+        if has_energy:
+            return HamiltonianSystem(lambda q, p: rate**2 * system.hamiltonian(q, p / rate))
+
+        def rates(q: Latent, p: Latent) -> tuple[Latent, Latent]:
+            qd, pd = system.rates(q, p / rate)
+            return rate * qd, rate**2 * pd
+
+        return PhaseRates(rates)
+
+    dynamics = Model(unit.init, slowed)
     encoder = _residual_network("encoder", width, 1, activation)
     decoder = _residual_network("decoder", width, components, activation)
 
@@ -152,22 +166,6 @@ def make_image_model(
         return LatentPhase(encode, decode, inner.field)
 
     return ImageModel(init, images, coefficients, dynamics)
-
-
-# States and rates of the models are of order 1; their motions take 1 / rate frames per unit of the models' time. With
-# P = p / rate: (q, p)' = (rate Q'(q, P), rate² P'(q, P)), and for an energy H0(q, P), H = rate² H0.
-
-
-def _slowed_energy(system: HamiltonianSystem, rate: float) -> HamiltonianSystem:
-    return HamiltonianSystem(lambda q, p: rate**2 * system.hamiltonian(q, p / rate))
-
-
-def _slowed_rates(system: PhaseRates, rate: float) -> PhaseRates:
-    def rates(q: Latent, p: Latent) -> tuple[Latent, Latent]:
-        qd, pd = system.rates(q, p / rate)
-        return rate * qd, rate**2 * pd
-
-    return PhaseRates(rates)
 
 
 def _residual_network(name: str, width: int, outputs: int, activation: Activation) -> hk.Transformed:

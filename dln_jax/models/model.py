@@ -20,7 +20,6 @@ positive, and for scales that are neither one number nor one per coordinate.
 import inspect
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -68,21 +67,6 @@ class Model(NamedTuple):
         return f"Model of {count:,} parameters\n  {shapes:.100}"
 
 
-@dataclass(frozen=True, eq=False)
-class OfSize:
-    """An energy of vectors [size], which refuses other sizes."""
-
-    function: Callable[..., Any]
-    size: int
-
-    def __call__(self, *state: Array) -> Any:
-        """Returns the energy; raises `InputError` for vectors of another size."""
-        for vector in state:
-            if vector.shape != (self.size,):
-                require_shape("a state of this model", vector.shape, (self.size,))
-        return self.function(*state)
-
-
 def make_delan(
     needs: Needs,
     *,
@@ -106,7 +90,7 @@ def make_delan(
     terms = partial(
         structured_terms, needs, networks, "cholesky", diagonal_shift, diagonal_floor, shared_trunk=shared_trunk
     )
-    return model_of(NaturalSystem, terms, needs.degrees_of_freedom, dtype)
+    return model_of(NaturalSystem, terms, needs, dtype)
 
 
 def make_black_box_lagrangian(
@@ -128,19 +112,20 @@ def make_black_box_lagrangian(
     """
     rates = per_coordinate(needs, "rate_scale", rate_scale)
     terms = partial(black_box_terms, needs, perceptrons(width, depth, activation), "lagrangian", rates)
-    return model_of(LagrangianSystem, terms, needs.degrees_of_freedom, dtype)
+    return model_of(LagrangianSystem, terms, needs, dtype)
 
 
 def model_of(
-    record: Callable[..., Any], terms: Callable[[], Mapping[str, Callable[..., Any] | None]], d: int, dtype: Any
+    record: Callable[..., Any], terms: Callable[[], Mapping[str, Callable[..., Any] | None]], needs: Needs, dtype: Any
 ) -> Model:
     """Returns the model whose energies are `record(**terms)`.
 
     Args:
         record: takes functions of one state as keywords; absent terms are not passed.
         terms: builds Haiku modules and returns functions that use them, by name; `None` for absent terms.
-        d: degrees of freedom. Parameters are initialised at the arguments (0, 1, ..), where no two bodies coincide.
+        needs: needs of the scene. Parameters are initialised at the arguments (0, 1, ..), where no two bodies coincide.
     """
+    d = needs.degrees_of_freedom
 
     def build():
         functions = {name: term for name, term in terms().items() if term is not None}
@@ -152,12 +137,16 @@ def model_of(
         return initialise, functions
 
     networks = hk.without_apply_rng(hk.multi_transform(build))
-    return Model(
-        init=lambda key: networks.init(key, jnp.asarray(np.arange(d), dtype)),
-        energies=lambda parameters: record(
-            **{name: OfSize(partial(function, parameters), d) for name, function in networks.apply.items()}
-        ),
-    )
+
+    def energies(parameters: Parameters) -> Any:
+        def checked(function: Callable[..., Any], *state: Array) -> Any:
+            for vector in state:
+                require_shape("a state of this model", vector.shape, (d,))
+            return function(parameters, *state)
+
+        return record(**{name: partial(checked, function) for name, function in networks.apply.items()})
+
+    return Model(lambda key: networks.init(key, jnp.asarray(np.arange(d), dtype)), energies)
 
 
 def linearised(

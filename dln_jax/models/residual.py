@@ -103,7 +103,7 @@ def make_residual(
         "dissipation": ("dissipation", dissipation),
         "inertia": ("cholesky", cholesky),
     }
-    return model_of(Residual, lambda: dict(every[term] for term in terms), d, dtype)
+    return model_of(Residual, lambda: dict(every[term] for term in terms), needs, dtype)
 
 
 def frozen(model: Model, rigid: Any) -> Model:

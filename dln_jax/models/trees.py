@@ -115,14 +115,14 @@ def make_rigid_tree(
     shape = FrictionShape(velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift)
     shape = FrictionShape(*(np.asarray(value) if isinstance(value, tuple) else value for value in shape))
     require_shape(shape)
-    shares = load if isinstance(load, tuple) else (load,)
+    shares = np.ravel(load)
     if not all(0 <= share < 1 for share in shares):
         raise InputError(f"load is {load}; expected a share of at least 0 and less than 1, or one for each joint")
     if any(shares) and "load" not in laws:
         raise InputError(f"load is {load}, but friction has {', '.join(laws) or 'no law'}; add 'load' to friction")
     d = tree.degrees_of_freedom
     names = coefficients_of(laws)
-    cools = any(cooling) if isinstance(cooling, tuple) else bool(cooling)
+    cools = np.any(cooling)
     if cools and not set(names) & set(WARM):
         raise InputError(f"cooling is {cooling}, but friction has {', '.join(laws) or 'no law'}; add 'viscous' to it")
     require_motors(motors, coupled, d)
@@ -195,14 +195,16 @@ def make_serial_tree(
             actuation matrix, a joint map or joint friction laws.
     """
     require_positive(acceleration=acceleration, velocity_scale=velocity_scale)
-    if needs.actuation is not None:
-        raise InputError("a learned tree has a motor at each joint; leave actuation out of the needs")
-    if needs.joint_map is not None:
-        raise InputError("a learned tree takes coordinates of its joints; leave joint_map out of the needs")
-    if needs.joint_friction:
-        raise InputError(
-            "a learned tree has viscous, dry and offset friction: state friction in its needs, and no joint_friction"
-        )
+    for name, remedy in (
+        ("actuation", "has a motor at each joint; leave actuation out of the needs"),
+        ("joint_map", "takes coordinates of its joints; leave joint_map out of the needs"),
+        (
+            "joint_friction",
+            "has viscous, dry and offset friction: state friction in its needs, and no joint_friction",
+        ),
+    ):
+        if getattr(needs, name):
+            raise InputError(f"a learned tree {remedy}")
     d = needs.degrees_of_freedom
     if parents is not None and (
         len(parents) != d or any(not -1 <= parent < link for link, parent in enumerate(parents))
@@ -219,10 +221,8 @@ def make_serial_tree(
         return SerialTreeParameters(turns, 0.15 * positions, inertias, armature, none, none, none)
 
     def energies(parameters: SerialTreeParameters) -> RecursiveSystem:
-        dissipation = None
-        if needs.friction:
-            coefficients = parameters.viscous, parameters.coulomb, parameters.offset
-            dissipation = joint_dissipation(*coefficients, velocity_scale=velocity_scale)
+        coefficients = parameters.viscous, parameters.coulomb, parameters.offset
+        dissipation = joint_dissipation(*coefficients, velocity_scale=velocity_scale)
         return tree_system(tree_of(parameters, needs, parents=parents, acceleration=acceleration), dissipation)
 
     return Model(init, energies)

@@ -10,27 +10,30 @@ The basis b is the product over joints of {1, cos q, .., cos nq, sin q, .., sin 
 is linear in all parameters, so a linear least-squares problem identifies them (`learning.linear`), as Atkeson, An and
 Hollerbach (1986, "Estimation of inertial parameters of manipulator loads and links") did for rigid bodies.
 
-The basis contains rigid links on revolute joints: V has degree 1 in every angle, and M degree 1 if the chain is planar,
-otherwise 2. M is definite only where the data make it so; a singular M gives non-finite accelerations.
+Rigid links on revolute joints need degree 1 in every angle for V; M needs degree 1 if the chain is planar and 2
+otherwise. The form does not make M positive definite, only the data do; a singular M gives non-finite accelerations.
 
-A chain of links in one plane, on a fixed base, a slide or several, needs fewer parameters (`make_planar_chain`). With
-the links' absolute angles phi, measured from hanging straight down,
+A planar chain on a fixed base, or on one or more slides, needs fewer parameters (`make_planar_chain`). With the links'
+absolute angles phi, measured from hanging straight down,
 
     T = ½ sum_ij (A_ij cos(phi_i - phi_j) + B_ij sin(phi_i - phi_j)) phid_i phid_j + ½ sum_i a_i w_i²
     V = -sum_i (g_i cos phi_i + h_i sin phi_i)
     D = sum_i ½ b_i w_i² + c_i v log cosh(w_i / v),   w_i = phid_i - phid_{i-1}, the joint's rate
 
-A is symmetric and B skew. B and h vanish if the centres of mass lie on the lines between joints and the zeros of the
-angles are right; the armature a_1 of the first motor is part of A_11. All parameters enter linearly
-(`learning.linear.fit_linear`) and are identifiable from motions ("base parameters"): for a double pendulum, g_2 / A_12
-is the acceleration of gravity divided by the first link's length. Friction acts in the joints, for any coordinates.
+A is symmetric and B skew. B and h vanish if every centre of mass lies on the line between its joints and the angles are
+zero at rest; A_11 includes the armature a_1 of the first motor. All parameters enter linearly
+(`learning.linear.fit_linear`), and motions identify all of them ("base parameters"): for a double pendulum, g_2 / A_12
+is the acceleration of gravity divided by the length of the first link. Friction acts in the joints, whatever the
+coordinates.
 
-Slides, which come before all hinges, have phi = 0: A_ij and B_ij of a slide and a link are the components of a mass
-times a length along the slide. Their phid in T is the rate of the displacement x, and V has g_i x²/2 - h_i x, a spring
-and the weight along the slide, in place of their other terms.
+Slides come before all hinges and have phi = 0; in T, the rate of their displacement x takes the place of phid. A_ij and
+B_ij of a slide and a link are the components of a mass times a length along the slide. For a slide, V contains
+g_i x²/2 - h_i x: a spring, and the weight along the slide.
 """
 
 import functools
+import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -46,7 +49,8 @@ from dln_jax.models.model import Model
 from dln_jax.types import InputError, JointKind, Matrix, Needs, Scalar, Vector, require_positive
 
 MOST_COEFFICIENTS = 20_000
-"""Limit on the coefficients of the mass matrix, which grow exponentially with the joints (the fit with the square)."""
+"""Largest number of coefficients of the mass matrix. The number grows exponentially with the joints, and the cost of a
+fit with its square."""
 SPRING_DEGREE = 2
 """Lower bound on the degree of the potential in a prismatic displacement, so that it includes a linear spring."""
 
@@ -62,15 +66,6 @@ class TrigonometricParameters(NamedTuple):
     """Viscous friction [d], in N m s or N s/m."""
 
 
-class Basis(NamedTuple):
-    """The basis functions at one q."""
-
-    values: Array
-    """b [B]; the first is 1."""
-    slopes: Array
-    """db/dq [d, B]."""
-
-
 def make_trigonometric(
     needs: Needs,
     *,
@@ -83,10 +78,10 @@ def make_trigonometric(
     `init` ignores its key: M = 1, V = 0, no friction. The number of parameters grows like (2 degree + 1)^d d²/2.
 
     Args:
-        degree: degree of the basis in every joint, or one for all; >= 0. In a prismatic displacement the potential has
-            at least degree 2 (a linear spring).
-        potential_degree: degree of the potential if it differs: M of a chain on a fixed base does not depend on its
-            first joint, but V does.
+        degree: degree of the basis, >= 0: one for all joints, or one per joint. In a prismatic displacement the
+            potential has at least degree 2 (a linear spring).
+        potential_degree: degree of the potential, if it differs from that of the mass matrix. On a fixed base, V
+            depends on the first joint and M does not.
 
     Raises:
         InputError: a degree is not an integer >= 0, the number of degrees is wrong, or the basis is too large to fit.
@@ -94,17 +89,16 @@ def make_trigonometric(
     d = needs.degrees_of_freedom
     degrees = _per_joint("degree", degree, d)
     of_potential = degrees if potential_degree is None else _per_joint("potential_degree", potential_degree, d)
-    mass_basis = functools.partial(basis, needs.joints, degrees)
     spring_degrees = tuple(
         max(n, SPRING_DEGREE) if joint == "prismatic" else n
         for joint, n in zip(needs.joints, of_potential, strict=True)
     )
+    mass_basis = functools.partial(basis, needs.joints, degrees)
     potential_basis = functools.partial(basis, needs.joints, spring_degrees)
     rows, columns = np.tril_indices(d)
     # (i, j) and (j, i) of M read the same row of coefficients.
     entry = np.zeros((d, d), int)
     entry[rows, columns] = entry[columns, rows] = np.arange(len(rows))
-
     entries, functions = len(rows), _size(needs.joints, degrees)
     if entries * functions > MOST_COEFFICIENTS:
         raise InputError(
@@ -126,15 +120,15 @@ def make_trigonometric(
         coefficients, potential, friction = parameters.mass[entry], parameters.potential, parameters.friction
 
         def coriolis(q: Vector, qd: Vector) -> Vector:
-            slopes = mass_basis(q).slopes
+            _, slopes = mass_basis(q)
             kinetic = 0.5 * jnp.einsum("i,ijl,j->l", qd, coefficients, qd)
             return (coefficients @ (qd @ slopes)) @ qd - slopes @ kinetic
 
         return ClosedForm(
-            mass_matrix=lambda q: coefficients @ mass_basis(q).values,
+            mass_matrix=lambda q: coefficients @ mass_basis(q)[0],
             coriolis=coriolis,
-            potential=None if potential is None else lambda q: potential_basis(q).values[1:] @ potential,
-            gravity=None if potential is None else lambda q: potential_basis(q).slopes[:, 1:] @ potential,
+            potential=None if potential is None else lambda q: potential_basis(q)[0][1:] @ potential,
+            gravity=None if potential is None else lambda q: potential_basis(q)[1][:, 1:] @ potential,
             dissipation=None if friction is None else lambda q, qd: 0.5 * jnp.sum(friction * qd**2),
             friction=None if friction is None else lambda q, qd: friction * qd,
         )
@@ -149,37 +143,33 @@ def _per_joint(name: str, degree: int | tuple[int, ...], d: int) -> tuple[int, .
     return degrees
 
 
-def basis(joints: tuple[JointKind, ...], degrees: tuple[int, ...], q: Vector) -> Basis:
-    """Returns the products over joints of the joints' functions, and their partial derivatives."""
-    factors = [_joint_basis(*joint) for joint in zip(joints, degrees, q, strict=True)]
-    values = [factor.values for factor in factors]
-    slopes = [
-        _products([*values[:joint], factor.slopes[0], *values[joint + 1 :]]) for joint, factor in enumerate(factors)
-    ]
-    return Basis(_products(values), jnp.stack(slopes))
+def basis(
+    joints: tuple[JointKind, ...], degrees: tuple[int, ...], q: Vector
+) -> tuple[Float[Array, " B"], Float[Array, "d B"]]:
+    """Returns the basis functions b, the first of which is 1, and their derivatives db/dq."""
+    values, slopes = zip(*map(_joint_basis, joints, degrees, q), strict=True)
+    along = [_products([*values[:joint], slope, *values[joint + 1 :]]) for joint, slope in enumerate(slopes)]
+    return _products(values), jnp.stack(along)
 
 
-def _joint_basis(joint: JointKind, degree: int, x: Scalar) -> Basis:
+def _joint_basis(joint: JointKind, degree: int, x: Scalar) -> tuple[Array, Array]:
+    """Returns the functions of one joint, and their derivatives."""
     one, zero = jnp.ones(1, x.dtype), jnp.zeros(1, x.dtype)
+    orders = np.arange(1, degree + 1)
     if joint == "revolute":
-        orders = np.arange(1, degree + 1)
         cosines, sines = jnp.cos(orders * x), jnp.sin(orders * x)
-        values = jnp.concatenate([one, cosines, sines])
-        slopes = jnp.concatenate([zero, -orders * sines, orders * cosines])
-    else:
-        values = jnp.concatenate([one, *(jnp.reshape(x**order, 1) for order in range(1, degree + 1))])
-        slopes = jnp.concatenate([zero, np.arange(1, degree + 1) * values[:-1]])
-    return Basis(values, slopes[None])
+        return jnp.concatenate([one, cosines, sines]), jnp.concatenate([zero, -orders * sines, orders * cosines])
+    values = jnp.concatenate([one, *(jnp.reshape(x**order, 1) for order in range(1, degree + 1))])
+    return values, jnp.concatenate([zero, orders * values[:-1]])
 
 
-def _products(factors: list[Array]) -> Float[Array, " B"]:
+def _products(factors: Sequence[Array]) -> Float[Array, " B"]:
     return functools.reduce(lambda products, factor: jnp.outer(products, factor).ravel(), factors)
 
 
 def _size(joints: tuple[JointKind, ...], degrees: tuple[int, ...]) -> int:
-    """Returns B."""
-    sizes = (2 * n + 1 if joint == "revolute" else n + 1 for joint, n in zip(joints, degrees, strict=True))
-    return int(np.prod([*sizes]))
+    """Returns the number of basis functions, B."""
+    return math.prod(2 * n + 1 if joint == "revolute" else n + 1 for joint, n in zip(joints, degrees, strict=True))
 
 
 class PlanarChainParameters(NamedTuple):
@@ -236,7 +226,7 @@ def make_planar_chain(
     if signs.shape != (d,) or not (np.abs(signs) == 1).all():
         raise InputError(f"directions are {directions}; expected 1 or -1 for each of the {d} joints")
     # phi and displacements = absolute q, and rates of the joints w = relative qd.
-    sums = np.where(hinge[:, None] & hinge, np.tril(np.ones((d, d))), np.eye(d))
+    sums = np.where(hinge[:, None] & hinge, np.tri(d), np.eye(d))
     absolute: Any = (sums if coordinates == "relative" else np.eye(d)) * signs
     relative: Any = np.linalg.inv(sums) @ absolute
     turning: Any = hinge[:, None] * absolute
@@ -248,7 +238,7 @@ def make_planar_chain(
             return jnp.zeros(count, dtype) if wanted else None
 
         return PlanarChainParameters(
-            moments=jnp.asarray((triangle[0] == triangle[1]).astype(float), dtype),
+            moments=jnp.asarray(triangle[0] == triangle[1], dtype),
             skew=zeros(len(below[0]), not symmetric),
             armature=zeros(len(geared), armature),
             weight=zeros(d, needs.gravity),
@@ -259,10 +249,10 @@ def make_planar_chain(
 
     def energies(parameters: PlanarChainParameters) -> ClosedForm:
         moments, skew, motors, weight, sideways, viscous, coulomb = parameters
-        like = jnp.zeros((d, d), moments.dtype)
-        A = like.at[triangle].set(moments)
-        A = A + A.T - jnp.diag(jnp.diagonal(A))
-        B = None if skew is None else like.at[below].set(skew) - like.at[below].set(skew).T
+        zero = jnp.zeros((d, d), moments.dtype)
+        lower = zero.at[triangle].set(moments)
+        A = lower + jnp.tril(lower, -1).T
+        B = None if skew is None else zero.at[below].set(skew) - zero.at[below].set(skew).T
         fixed = 0.0 if motors is None else relative.T @ jnp.diag(jnp.zeros(d).at[geared].set(motors)) @ relative
 
         def mass_matrix(q: Vector) -> Matrix:
@@ -280,17 +270,9 @@ def make_planar_chain(
             height = weight @ jnp.where(hinge, jnp.cos(place), -(place**2) / 2)
             return -height if sideways is None else -height - sideways @ jnp.where(hinge, jnp.sin(place), place)
 
-        dissipation = None
-        if viscous is not None:
-            dissipation = joint_dissipation(viscous, coulomb, velocity_scale=velocity_scale, joint_map=relative)
-        return ClosedForm(
-            mass_matrix=mass_matrix,
-            coriolis=coriolis,
-            potential=None if weight is None else potential,
-            gravity=None if weight is None else jax.grad(potential),
-            dissipation=dissipation,
-            friction=None if dissipation is None else jax.grad(dissipation, argnums=1),
-        )
+        dissipation = joint_dissipation(viscous, coulomb, velocity_scale=velocity_scale, joint_map=relative)
+        held = (None, None) if weight is None else (potential, jax.grad(potential))
+        return ClosedForm(mass_matrix, coriolis, *held, dissipation)
 
     return Model(init, energies)
 

@@ -16,13 +16,14 @@ and the derivatives with respect to x follow from g' and g'' of the activation:
 A backward sweep costs one pass per output, a forward sweep one per input or pair of inputs. `cheaper_jacobian` and
 `cheaper_hessian` count floating point operations, and the shapes decide before anything is compiled.
 
-One state, no batch axis: `jax.vmap` over x. In the code the n inputs are the first axis of J [n, width], so that a
-batch of Jacobians and a weight form one matrix product.
+One state, no batch axis: `jax.vmap` over x. The layers of an ensemble have a leading axis of members. In the code the n
+inputs are the first axis of J [n, width], so that a batch of Jacobians and a weight form one matrix product.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -62,6 +63,11 @@ def init(
         (weight(ours[0], shape, dtype), bias(ours[1], shape[1:], dtype))
         for shape, ours in zip(shapes, keys, strict=True)
     )
+
+
+def init_ensemble(key: PRNGKeyArray | Array, sizes: Sequence[int], *, members: int, **schemes: Any) -> Layers:
+    """`init` for as many keys as there are members: weights [members, in, out], biases [members, out]."""
+    return jax.vmap(partial(init, sizes=sizes, **schemes))(jax.random.split(key, members))
 
 
 def layer_shapes(sizes: Sequence[int]) -> list[tuple[int, int]]:
@@ -106,6 +112,25 @@ def value_jacobian_and_hessian(
     return y, *derivatives(layers, preactivations, activation)
 
 
+def mean_and_spread(network: Callable[[Layers, Array], Any], layers: Layers, x: Array) -> tuple[Any, Any]:
+    """Mean and spread over K members at x [n] of all outputs of `network(layers, x)`.
+
+    The spread is the sample standard deviation (the sum of squares over K - 1).
+
+    `network` is a function of one member, for instance
+    `partial(value_jacobian_and_hessian, activation=tanh)` for the statistics of value, Jacobian and
+    Hessian. The arrays of `layers` have a leading axis of members, as from `init_ensemble`.
+
+    Raises InputError for fewer than two members, which have no spread.
+    """
+    members = layers[0][0].shape[0]
+    if members < 2:
+        raise InputError(f"the ensemble has {members} member; its spread needs two or more")
+    outputs = jax.vmap(network, in_axes=(0, None))(layers, x)
+    mean, spread = partial(jnp.mean, axis=0), partial(jnp.std, axis=0, ddof=1)
+    return jax.tree.map(mean, outputs), jax.tree.map(spread, outputs)
+
+
 def cheaper_jacobian(sizes: Sequence[int]) -> Sweep:
     """Sweep with fewer operations for the Jacobian of a network with `sizes` (n, width, ..., m)."""
     inputs, *widths, outputs = sizes
@@ -140,7 +165,7 @@ def _check(layers: Layers, x: Array) -> tuple[int, ...]:
     if not chained or any(left[1] != right[0] for (left, _), (right, _) in pairwise(shapes)):
         raise InputError(
             f"layers have (weight, bias) shapes {shapes}; expected one network, weight [in, out] and bias [out] with "
-            "each in equal to the out before it. Members of an ensemble need jax.vmap: see nn/ensembles.py"
+            "each in equal to the out before it. Members of an ensemble need jax.vmap, as in mean_and_spread"
         )
     sizes = (shapes[0][0][0], *(weight[1] for weight, _ in shapes))
     if x.shape != sizes[:1]:

@@ -23,8 +23,8 @@ def mass_spring(*, mass: float = 1.0, stiffness: float = 1.0, friction: float = 
     def tip(q: Vector) -> Vector:
         return jnp.array([q[0], 0.0])
 
-    attraction = (potential, gravity) if stiffness else (None, None)
-    return textbook("mass-spring", ("prismatic",), mass_matrix, no_coriolis, *attraction, tip, friction=friction)
+    equations = mass_matrix, no_coriolis, potential if stiffness else None, gravity, tip
+    return textbook("mass-spring", ("prismatic",), *equations, friction=friction)
 
 
 def henon_heiles(*, coupling: float = 1.0, friction: float = 0.0) -> Scene:
@@ -108,6 +108,6 @@ def n_body(
         pull = (strength / distance**3)[:, None] * separation
         return jnp.matmul(matrix.T, pull, precision="highest").ravel()
 
-    attraction = (potential, gravity) if G else (None, None)
     tip = (lambda q: q[-2:]) if dimension == 2 else None
-    return textbook(f"{n}-body", ("prismatic",) * (n * dimension), mass_matrix, no_coriolis, *attraction, tip)
+    equations = mass_matrix, no_coriolis, potential if G else None, gravity, tip
+    return textbook(f"{n}-body", ("prismatic",) * (n * dimension), *equations)

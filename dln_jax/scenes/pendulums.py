@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.scenes.scene import Scene, no_coriolis, textbook
-from dln_jax.types import InputError, Matrix, Needs, Scalar, Vector
+from dln_jax.types import InputError, JointKind, Matrix, Needs, Scalar, Vector
 
 LINK_LENGTH = 1.0
 """Length of both links in m."""
@@ -28,8 +28,8 @@ def pendulum(*, mass: float = 1.0, length: float = 1.0, acceleration: float = 9.
     def tip(q: Vector) -> Vector:
         return length * jnp.array([jnp.sin(q[0]), -jnp.cos(q[0])])
 
-    attraction = (potential, gravity) if weight else (None, None)
-    return textbook("pendulum", ("revolute",), mass_matrix, no_coriolis, *attraction, tip, friction=friction)
+    equations = mass_matrix, no_coriolis, potential if weight else None, gravity, tip
+    return textbook("pendulum", ("revolute",), *equations, friction=friction)
 
 
 def double_pendulum(
@@ -40,32 +40,56 @@ def double_pendulum(
     friction: float = 0.0,
 ) -> Scene:
     """Two point masses on massless rods, angles from the vertical, q = 0 hanging; in kg, m, m/s², N m s per joint."""
-    inner, outer = lengths
-    total = masses[0] + masses[1]
-    coupling = masses[1] * inner * outer
-    inner_weight = total * acceleration * inner
-    outer_weight = masses[1] * acceleration * outer
+    carried = np.array([masses[0] + masses[1], masses[1]])
+    rods = np.array(lengths)
+    coupling = np.diag(carried * rods**2)
+    coupling[0, 1] = coupling[1, 0] = masses[1] * rods[0] * rods[1]
+    return _hanging("double-pendulum", coupling, carried * acceleration * rods, rods, friction=friction)
+
+
+def _hanging(
+    name: str,
+    coupling: np.ndarray,
+    weight: np.ndarray,
+    lengths: np.ndarray,
+    *,
+    relative: bool = False,
+    friction: float,
+) -> Scene:
+    """Returns a planar chain that hangs at q = 0, from its equations in the rods' angles θ from the vertical.
+
+    Args:
+        coupling: a in M_ij = a_ij cos(θ_i - θ_j), kg m².
+        weight: torque that holds each rod horizontal, with all that it carries, N m.
+        lengths: lengths of the rods, m.
+        relative: whether q holds angles between neighbours: θ = S q = cumsum(q), M = Sᵀ M_θ S, and likewise for forces.
+    """
+
+    def same(x: Any) -> Any:
+        return x
+
+    to_angles, to_joints = (jnp.cumsum, _sum_outwards) if relative else (same, same)
 
     def mass_matrix(q: Vector) -> Matrix:
-        off_diagonal = coupling * jnp.cos(q[0] - q[1])
-        return jnp.array([[total * inner**2, off_diagonal], [off_diagonal, masses[1] * outer**2]])
+        angles = to_angles(q)
+        return to_joints(to_joints(coupling * jnp.cos(angles[:, None] - angles)).T)
 
     def coriolis(q: Vector, qd: Vector) -> Vector:
-        sine = coupling * jnp.sin(q[0] - q[1])
-        return jnp.array([sine * qd[1] ** 2, -sine * qd[0] ** 2])
+        angles = to_angles(q)
+        return to_joints((coupling * jnp.sin(angles[:, None] - angles)) @ to_angles(qd) ** 2)
 
     def potential(q: Vector) -> Scalar:
-        return inner_weight * (1 - jnp.cos(q[0])) + outer_weight * (1 - jnp.cos(q[1]))
+        return jnp.sum(weight * (1 - jnp.cos(to_angles(q))))
 
     def gravity(q: Vector) -> Vector:
-        return jnp.array([inner_weight, outer_weight]) * jnp.sin(q)
+        return to_joints(weight * jnp.sin(to_angles(q)))
 
     def tip(q: Vector) -> Vector:
-        rods = jnp.array(lengths)
-        return jnp.array([rods @ jnp.sin(q), -rods @ jnp.cos(q)])
+        angles = to_angles(q)
+        return jnp.array([lengths @ jnp.sin(angles), -lengths @ jnp.cos(angles)])
 
-    joints = ("revolute", "revolute")
-    return textbook("double-pendulum", joints, mass_matrix, coriolis, potential, gravity, tip, friction=friction)
+    joints = ("revolute",) * len(weight)
+    return textbook(name, joints, mass_matrix, coriolis, potential, gravity, tip, friction=friction)
 
 
 def two_link_arm(*, zero: Literal["horizontal", "hanging"] = "horizontal") -> Scene:
@@ -172,9 +196,6 @@ def chain(
 ) -> Scene:
     """Planar chain of uniform rods, angles relative to the previous link, q = 0 hanging; kg, m per link, m/s², N m s.
 
-    In absolute angles θ = cumsum(q) the equations are short (a_ij cos(θ_i - θ_j) couples rods i and j). The constant
-    matrix S of the sum transforms them to joint coordinates: M = Sᵀ M_θ S, and likewise for forces.
-
     Raises:
         InputError: d < 1.
     """
@@ -186,26 +207,7 @@ def chain(
     np.fill_diagonal(coupling, mass * length**2 * (outer_rods + 1 / 3))
     weight = mass * acceleration * length * (outer_rods + 0.5)
 
-    def mass_matrix(q: Vector) -> Matrix:
-        angles = jnp.cumsum(q)
-        return _sum_outwards(_sum_outwards(coupling * jnp.cos(angles[:, None] - angles)).T)
-
-    def coriolis(q: Vector, qd: Vector) -> Vector:
-        angles, rates = jnp.cumsum(q), jnp.cumsum(qd)
-        return _sum_outwards((coupling * jnp.sin(angles[:, None] - angles)) @ rates**2)
-
-    def potential(q: Vector) -> Scalar:
-        return jnp.sum(weight * (1 - jnp.cos(jnp.cumsum(q))))
-
-    def gravity(q: Vector) -> Vector:
-        return _sum_outwards(weight * jnp.sin(jnp.cumsum(q)))
-
-    def tip(q: Vector) -> Vector:
-        angles = jnp.cumsum(q)
-        return length * jnp.array([jnp.sum(jnp.sin(angles)), -jnp.sum(jnp.cos(angles))])
-
-    joints = ("revolute",) * d
-    return textbook(f"chain-{d}", joints, mass_matrix, coriolis, potential, gravity, tip, friction=friction)
+    return _hanging(f"chain-{d}", coupling, weight, np.full(d, length), relative=True, friction=friction)
 
 
 def _sum_outwards(forces):
@@ -235,17 +237,10 @@ def cart_pole(
     def coriolis(q: Vector, qd: Vector) -> Vector:
         return jnp.array([-coupling * jnp.sin(q[1]) * qd[1] ** 2, 0.0])
 
-    def potential(q: Vector) -> Scalar:
-        return weight * jnp.cos(q[1])
-
-    def gravity(q: Vector) -> Vector:
-        return jnp.array([0.0, -weight * jnp.sin(q[1])])
-
     def tip(q: Vector) -> Vector:
         return jnp.array([q[0] + length * jnp.sin(q[1]), length * jnp.cos(q[1])])
 
-    equations = mass_matrix, coriolis, potential, gravity, tip
-    return textbook("cart-pole", ("prismatic", "revolute"), *equations, friction=friction, actuation=((1.0,), (0.0,)))
+    return _driven_pole("cart-pole", "prismatic", mass_matrix, coriolis, weight, tip, friction)
 
 
 def flexible_cart_pole(
@@ -332,14 +327,22 @@ def rotary_pendulum(
         turning = about_hinge * jnp.sin(2 * q[1])
         return jnp.array([turning * qd[0] * qd[1] - coupling * jnp.sin(q[1]) * qd[1] ** 2, -0.5 * turning * qd[0] ** 2])
 
+    def tip(q: Vector) -> Vector:
+        return pole_length * jnp.array([jnp.sin(q[1]), jnp.cos(q[1])])
+
+    return _driven_pole("rotary-pendulum", "revolute", mass_matrix, coriolis, weight, tip, friction)
+
+
+def _driven_pole(
+    name: str, base: JointKind, mass_matrix: Any, coriolis: Any, weight: float, tip: Any, friction: float
+) -> Scene:
+    """Returns a driven base with a free pole, q[1] from upright; its weight is the torque that holds it horizontal."""
+
     def potential(q: Vector) -> Scalar:
         return weight * jnp.cos(q[1])
 
     def gravity(q: Vector) -> Vector:
         return jnp.array([0.0, -weight * jnp.sin(q[1])])
 
-    def tip(q: Vector) -> Vector:
-        return pole_length * jnp.array([jnp.sin(q[1]), jnp.cos(q[1])])
-
     equations, actuation = (mass_matrix, coriolis, potential, gravity, tip), ((1.0,), (0.0,))
-    return textbook("rotary-pendulum", ("revolute", "revolute"), *equations, friction=friction, actuation=actuation)
+    return textbook(name, (base, "revolute"), *equations, friction=friction, actuation=actuation)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.closed_form import ClosedForm
@@ -70,11 +70,13 @@ def textbook(
 ) -> Scene:
     """Builds a scene from its equations, friction and actuation.
 
-    Friction is viscous, D = ½ b |qd|² with the torque b qd; there is none if b (N m s or N s/m) is zero.
+    Friction is viscous, D = ½ b |qd|² with the torque b qd; there is none if b (N m s or N s/m) is zero. Without a
+    potential, `gravity` is not used.
     """
     needs = Needs(joints, gravity=potential is not None, friction=friction != 0, actuation=actuation)
-    dissipation = None if friction == 0 else (lambda q, qd: 0.5 * friction * jnp.sum(qd**2))
-    return Scene(name, needs, mass_matrix, coriolis, potential, gravity, dissipation, tip)
+    force = gravity if needs.gravity else None
+    dissipation = (lambda q, qd: 0.5 * friction * jnp.sum(qd**2)) if needs.friction else None
+    return Scene(name, needs, mass_matrix, coriolis, potential, force, dissipation, tip)
 
 
 def closed_form_forward_dynamics(scene: Scene, q: Vector, qd: Vector, tau: Vector) -> Vector:
@@ -86,13 +88,6 @@ def closed_form_forward_dynamics(scene: Scene, q: Vector, qd: Vector, tau: Vecto
 def no_coriolis(q: Vector, qd: Vector) -> Vector:
     """Returns the Coriolis force of a constant mass matrix, zero."""
     return jnp.zeros_like(q)
-
-
-def actuation_matrix(needs: Needs) -> Float[Array, "d u"]:
-    """Returns B [d, u] in tau = B control; the identity if every coordinate has its own motor."""
-    if needs.actuation is None:
-        return jnp.eye(needs.degrees_of_freedom)
-    return jnp.asarray(needs.actuation)
 
 
 def with_friction(

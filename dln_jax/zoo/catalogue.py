@@ -14,12 +14,17 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 
 from dln_jax.mechanics.trees.description import tree_from_json
-from dln_jax.models.baselines import make_feed_forward, make_helmholtz, make_phase_network
-from dln_jax.models.differential_network import make_differential_network
+from dln_jax.models.baselines import (
+    make_differential_network,
+    make_feed_forward,
+    make_helmholtz,
+    make_phase_network,
+)
 from dln_jax.models.hamiltonian import (
     make_black_box_hamiltonian,
     make_dissipative,
     make_pairwise_hamiltonian,
+    make_polynomial_hamiltonian,
     make_separable_hamiltonian,
     make_structured_hamiltonian,
 )
@@ -27,7 +32,6 @@ from dln_jax.models.joint_friction import with_joint_friction
 from dln_jax.models.kernel import make_trigonometric_kernel
 from dln_jax.models.latent_phase import make_image_model
 from dln_jax.models.model import Model, make_black_box_lagrangian, make_delan
-from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.models.residual import make_residual, make_with_residual
 from dln_jax.models.trees import Number, make_rigid_tree, make_serial_tree
 from dln_jax.models.trigonometric import make_planar_chain, make_trigonometric

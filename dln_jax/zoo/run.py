@@ -15,7 +15,7 @@ from dln_jax.files import is_file
 from dln_jax.mechanics import equations
 from dln_jax.mechanics.dynamics import Dynamics, Flow, InverseForward, PhaseRates, PlainDynamics, PlainFlow
 from dln_jax.models import uncertainty as uncertainties
-from dln_jax.models.differential_network import Derivatives, FunctionModel
+from dln_jax.models.baselines import Derivatives, FunctionModel
 from dln_jax.models.latent_phase import ImageModel, LatentPhase
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.uncertainty import Uncertainty, predictive

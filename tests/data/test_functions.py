@@ -14,7 +14,7 @@ from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples, published, published_grid
 from dln_jax.learning import functions as regression
 from dln_jax.learning.functions import Network, mean_loss, published_adam, targets
-from dln_jax.nn import ensembles
+from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import cos, tanh
 
 CASES = (
@@ -123,7 +123,7 @@ def test_a_network_of_standard_units_is_the_same_in_the_users_units():
     assert_allclose(standard.x.std(axis=0), 1)
     assert_allclose(standard.y.mean(axis=0), 0, atol=1e-12)
     for sizes in ((3, 4, 2), (3, 2)):
-        layers = ensembles.init(jax.random.key(0), sizes, members=1)
+        layers = differential_mlp.init_ensemble(jax.random.key(0), sizes, members=1)
         inner, _ = predict(layers, standard.x, activation=tanh)
         outer, _ = predict(layers_in_own_units(layers, units), data.x, activation=tanh)
         for ours, theirs in zip(to_units(outer, units), inner, strict=True):
@@ -136,7 +136,7 @@ def test_errors_are_sums_over_components_and_ensembles_average():
     off = truth._replace(y=truth.y + 0.5, dy=truth.dy + np.array([0.3, 0.4]), d2y=truth.d2y + 1.0)
     assert errors(off, truth) == pytest.approx({"value_mse": 0.25, "gradient_mse": 0.25, "hessian_mse": 4.0})
     assert set(errors(off, truth._replace(d2y=None))) == {"value_mse", "gradient_mse"}
-    layers = ensembles.init(jax.random.key(0), (2, 4, 1), members=3)
+    layers = differential_mlp.init_ensemble(jax.random.key(0), (2, 4, 1), members=3)
     mean, spread = predict(layers, truth.x, activation=tanh)
     alone = [
         predict(jax.tree.map(lambda a, k=k: a[k : k + 1], layers), truth.x, activation=tanh)[0].d2y for k in range(3)
@@ -151,7 +151,7 @@ def test_members_of_an_ensemble_train_as_if_alone():
     settings = Network(width=3, members=2, precision="f64", activation="tanh")
     optimiser = published_adam(len(sets.train.x), epochs=4, batch=20)
     together = regression.train(sets, settings, optimiser)
-    first = ensembles.init(jax.random.key(0), (1, 3, 1), members=2)
+    first = differential_mlp.init_ensemble(jax.random.key(0), (1, 3, 1), members=2)
     assert not np.allclose(*first[0][0])
     given = regression.problem(sets, settings._replace(members=1), together=True)
     alone = fit(given._replace(parameters=jax.tree.map(lambda leaf: leaf[1:], first)), optimiser)

@@ -13,9 +13,8 @@ from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.metrics import phase_space as phase_metrics
 from dln_jax.models.baselines import make_phase_network
-from dln_jax.models.hamiltonian import make_dissipative, make_separable_hamiltonian
+from dln_jax.models.hamiltonian import make_dissipative, make_polynomial_hamiltonian, make_separable_hamiltonian
 from dln_jax.models.model import Model
-from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.scenes.datasets import hamiltonian_tasks
 from dln_jax.types import Needs
 from tests.models.random_parameters import drawn

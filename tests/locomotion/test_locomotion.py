@@ -14,7 +14,8 @@ from jax.sharding import Mesh
 from PIL import Image
 
 from dln_jax.commands import train_locomotion
-from dln_jax.figures.soft_bodies import write_soft_body_gif
+from dln_jax.figures.animations import write_gif
+from dln_jax.figures.soft_bodies import soft_body_drawing
 from dln_jax.locomotion import gradient
 from dln_jax.locomotion.environment import CreatureEnvironment
 from dln_jax.locomotion.frames import Frame, axes_of, fitted_frame
@@ -269,9 +270,10 @@ def test_devices_that_do_not_divide_the_creatures_are_refused(task, policy):
 def test_animations_hold_their_frames_and_refuse_what_does_not_fit(task, tmp_path):
     mesh, muscles, path = task.creature.mesh, task.creature.muscles, tmp_path / "walk.gif"
     x, t = np.stack([mesh.vertices + np.array([0.1 * frame, 0]) for frame in range(5)]), 0.1 * np.arange(5)
-    write_soft_body_gif(path, mesh, x, t, muscles=muscles, actuation=np.full((5, 2), 0.5), title="block", stride=2)
+    drawing = soft_body_drawing(mesh, x, muscles=muscles, actuation=np.full((5, 2), 0.5))
+    write_gif(path, *drawing, t, frames=range(0, 5, 2), frames_per_second=15.0, title="block")
     assert Image.open(path).n_frames == 3
-    with one_line("4 times for 5 frames"):
-        write_soft_body_gif(path, mesh, x, t[:4])
+    with one_line("positions have shape"):
+        soft_body_drawing(mesh, x[:, :4])
     with one_line("actuation has shape"):
-        write_soft_body_gif(path, mesh, x, t, muscles=muscles, actuation=np.ones((5, 3)))
+        soft_body_drawing(mesh, x, muscles=muscles, actuation=np.ones((5, 3)))

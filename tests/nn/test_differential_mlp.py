@@ -1,16 +1,15 @@
-"""The one pass against autodiff of a plain network, its ensembles and its Haiku front."""
+"""The one pass and its ensembles against autodiff of a plain network."""
 
 from functools import partial
 from itertools import pairwise
 
-import haiku as hk
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
 
-from dln_jax.nn import activations, differential_mlp, ensembles, haiku_layers
+from dln_jax.nn import activations, differential_mlp
 from dln_jax.nn.differential_mlp import value, value_and_jacobian, value_and_pull_back, value_jacobian_and_hessian
 
 GELU = activations.gelu
@@ -104,33 +103,17 @@ def test_ensemble_equals_a_loop_over_its_members():
     sizes, members, key, x = (2, 4, 2), 3, jax.random.key(7), jnp.asarray([0.3, -0.8])
     normal = jax.nn.initializers.normal(0.5)
     init = jax.jit(partial(differential_mlp.init, sizes=sizes, bias=normal))
-    stacked = jax.jit(partial(ensembles.init, sizes=sizes, members=members, bias=normal))(key)
+    stacked = jax.jit(partial(differential_mlp.init_ensemble, sizes=sizes, members=members, bias=normal))(key)
     network = jax.jit(partial(value_and_jacobian, activation=GELU))
     outputs = []
     for index, own in enumerate(jax.random.split(key, members)):
         member = jax.tree.map(lambda leaf, index=index: leaf[index], stacked)
         assert_close(member, init(own))
         outputs.append(network(member, x))
-    means, spreads = jax.jit(partial(ensembles.mean_and_spread, network))(stacked, x)
+    means, spreads = jax.jit(partial(differential_mlp.mean_and_spread, network))(stacked, x)
     for of_members, mean, spread in zip(zip(*outputs, strict=True), means, spreads, strict=True):
         assert_close(mean, np.mean(of_members, axis=0))
         assert_close(spread, np.std(of_members, axis=0, ddof=1))
-
-
-def test_haiku_front_is_the_same_network():
-    def forward(x):
-        first = haiku_layers.layers((2, 5, 1), name="potential", bias=jax.nn.initializers.ones)
-        second = haiku_layers.layers((2, 3, 1), name="potential")
-        return value(first, x, activation=GELU), value(second, x, activation=GELU)
-
-    transformed, x = hk.transform(forward), jnp.asarray([0.3, -0.8])
-    parameters = jax.jit(transformed.init)(jax.random.key(0), x)
-    assert list(parameters) == ["potential/layer_0", "potential/layer_1", "potential_1/layer_0", "potential_1/layer_1"]
-    assert jax.tree.map(jnp.shape, parameters["potential/layer_0"]) == {"w": (2, 5), "b": (5,)}
-    assert parameters["potential/layer_0"]["b"].tolist() == [1.0] * 5
-    assert {leaf.dtype for leaf in jax.tree.leaves(parameters)} == {jnp.dtype(jnp.float64)}
-    layers = tuple((each["w"], each["b"]) for each in list(parameters.values())[:2])
-    assert_close(transformed.apply(parameters, None, x)[0], value(layers, x, activation=GELU))
 
 
 def test_initial_weights_follow_glorot():
@@ -155,7 +138,7 @@ def test_wrong_states_layers_and_sizes_are_refused():
     with one_line(r"ensemble need jax\.vmap"):
         value_and_jacobian(members, x, activation=GELU)
     with one_line("1 member; its spread needs two"):
-        ensembles.mean_and_spread(partial(value, activation=GELU), members, x)
+        differential_mlp.mean_and_spread(partial(value, activation=GELU), members, x)
     for sizes in ((), (2,), (2, 0, 1)):
         with one_line("sizes are"):
             differential_mlp.init(jax.random.key(0), sizes)

@@ -16,7 +16,6 @@ from dln_jax.scenes.pendulums import (
     pendulum,
     two_link_arm,
 )
-from dln_jax.scenes.scene import actuation_matrix
 
 
 def swing(angle):
@@ -93,6 +92,6 @@ def test_inverse_kinematics_reaches_the_tip():
 
 
 def test_needs_name_motors_and_a_chain_has_links():
-    np.testing.assert_array_equal(actuation_matrix(cart_pole().needs), [[1.0], [0.0]])
+    assert cart_pole().needs.actuation == ((1.0,), (0.0,))
     with one_line("at least 1"):
         chain(0)

@@ -10,7 +10,7 @@ from dln_jax.data.functions import FunctionSamples
 from dln_jax.learning.functions import Network
 from dln_jax.metrics.errors import mean_square
 from dln_jax.metrics.verdict import Verdict, held_out, judge, worst
-from dln_jax.nn import differential_mlp, ensembles
+from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import Activation
 from dln_jax.nn.differential_mlp import Layers
 
@@ -31,7 +31,7 @@ def predict(layers: Layers, x: np.ndarray, *, activation: Activation) -> tuple[F
     def answer(x: jax.Array):
         if members == 1:
             return network(jax.tree.map(lambda leaf: leaf[0], layers), x), None
-        return ensembles.mean_and_spread(network, layers, x)
+        return differential_mlp.mean_and_spread(network, layers, x)
 
     def samples(arrays) -> FunctionSamples:
         return FunctionSamples(*(np.asarray(array, np.float64) for array in (x, *arrays)))

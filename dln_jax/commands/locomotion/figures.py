@@ -8,13 +8,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dln_jax.figures import style
-from dln_jax.figures.soft_bodies import write_soft_body_gif
+from dln_jax.figures.animations import write_gif
+from dln_jax.figures.soft_bodies import soft_body_drawing
 from dln_jax.locomotion.learning import GOAL, Record
 from dln_jax.locomotion.task import LocomotionTask, Walk, beginning
 from dln_jax.softbody.terms.creature import ground_height
 
-FILMED = 160
-"""Steps of the film."""
+FILMED, STRIDE = 160, 2
+"""Steps of the film, and steps per frame."""
 SHOWN = 3_000_000
 """Seed of the rough ground that is shown."""
 
@@ -39,15 +40,8 @@ def write_gait(path: Path, task: LocomotionTask, seen: Walk, title: str) -> None
         margin = 0.2 * task.length
         along = np.linspace(x[..., 0].min() - margin, x[..., 0].max() + margin, 500)
         ground = np.stack([along, jax.vmap(lambda at: ground_height(bumps, (at,)))(along)], axis=1)
-    write_soft_body_gif(
-        path,
-        task.creature.mesh,
-        x,
-        task.dt * np.arange(len(x)),
-        muscles=task.creature.muscles,
-        ground=ground,
-        actuation=np.concatenate([seen.actuation[:1], seen.actuation])[: FILMED + 1],
-        title=title,
-        stride=2,
-        frames_per_second=0.5 / task.dt,
-    )
+    actuation = np.concatenate([seen.actuation[:1], seen.actuation])[: FILMED + 1]
+    creature, t = task.creature, task.dt * np.arange(len(x))
+    figure, show = soft_body_drawing(creature.mesh, x, muscles=creature.muscles, actuation=actuation, ground=ground)
+    frames = range(0, len(x), STRIDE)
+    write_gif(path, figure, show, t, frames=frames, frames_per_second=1 / (STRIDE * task.dt), title=title)

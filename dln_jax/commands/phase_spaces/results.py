@@ -10,8 +10,7 @@ import numpy as np
 from dln_jax.commands.phase_spaces.data import PhaseLog, spreads
 from dln_jax.commands.phase_spaces.training import MOTIONS, RATES, PhaseFit
 from dln_jax.data.schema import column
-from dln_jax.figures.animations import write_motion_gif
-from dln_jax.figures.phase_space import Field, motion_figure
+from dln_jax.figures.phase_space import Field, motion_figure, write_motion_gif
 from dln_jax.figures.style import TRUTH
 from dln_jax.figures.training import training_curve
 from dln_jax.learning.latency import one_step

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.commands.simulations.scenes import PreparedScene, in_precision
-from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure, write_soft_body_gif
+from dln_jax.figures.animations import write_gif
+from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure, soft_body_drawing
 from dln_jax.files import write_figure
 from dln_jax.metrics.report import Row
 from dln_jax.metrics.soft_body_energies import motion_energies
@@ -182,17 +183,16 @@ def figures_of(
         stored = motion_energies(example.scene, params, jnp.asarray(x), jnp.asarray(v), control)
         write_figure(path, energies_against_time(t, stored, taken=taken, title=title))
 
-    film = functools.partial(
-        write_soft_body_gif,
-        mesh=example.scene.mesh,
-        positions=x,
-        t=t,
-        muscles=example.muscles,
-        actuation=None if control is None else np.asarray(control),
-        ground=None if example.ground is None else 0.0,
-        slope=example.ground or 0.0,
-        title=scene,
-        stride=motion.stride,
-        frames_per_second=max(1 / (motion.stride * float(t[1])), 1.0),
-    )
+    def film(path: Path) -> None:
+        figure, show = soft_body_drawing(
+            example.scene.mesh,
+            x,
+            muscles=example.muscles,
+            actuation=None if control is None else np.asarray(control),
+            ground=None if example.ground is None else 0.0,
+            slope=example.ground or 0.0,
+        )
+        rate = max(1 / (motion.stride * float(t[1])), 1.0)
+        write_gif(path, figure, show, t, frames=range(0, len(t), motion.stride), frames_per_second=rate, title=scene)
+
     return {"energy.png": energies, "moments.png": png(moments_figure, [picture], columns=1), "motion.gif": film}

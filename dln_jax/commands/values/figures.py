@@ -69,9 +69,9 @@ def value_plane(run: ValueRun) -> Figure:
             axis.plot(q, path[:, 1], color=style.VERMILLION, linewidth=0.8, alpha=0.8)
         axis.plot(0, 0, "o", color="white", markeredgecolor="black", markersize=4.5)
         style.title(axis, f"{title}, other states at the goal" if d > 1 else title)
-        axis.set(xlim=across[[0, -1]], ylim=up[[0, -1]], xlabel=f"{names[k]} from the goal, {unit}")
         if turning and across[-1] > 3:
             angle_ticks(axis.xaxis)
+        axis.set(xlim=across[[0, -1]], ylim=up[[0, -1]], xlabel=f"{names[k]} from the goal, {unit}")
     axes[0].contour(across, up, V, np.linspace(0, most, LEVELS), colors="0.25", linewidths=0.35, zorder=1.5)
     axes[0].set_ylabel(f"rate, {unit}/s")
     return figure

@@ -18,7 +18,7 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.control.optimal.problem import ControlProblem, features
-from dln_jax.nn import differential_mlp, ensembles
+from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import Activation, softplus, tanh
 from dln_jax.sizes import require_network
 from dln_jax.types import InputError, require_positive
@@ -67,7 +67,7 @@ def value_network(
     diagonal = rows == columns
 
     def init(key: Array) -> Any:
-        layers = ensembles.init(key, (size, *widths, len(rows)), members=members)
+        layers = differential_mlp.init_ensemble(key, (size, *widths, len(rows)), members=members)
         # Without hidden layers, L is the bias of the output layer.
         return layers if widths else layers[-1][1]
 

@@ -41,7 +41,7 @@ from dln_jax.mechanics.dynamics import Dynamics, Flow, PhaseRates, PlainFlow
 from dln_jax.mechanics.equations import Canonical, Driven, System, dynamics, flow
 from dln_jax.mechanics.jacobians import Natural
 from dln_jax.mechanics.joint_friction import LoadedSystem
-from dln_jax.models.differential_network import FunctionModel
+from dln_jax.models.baselines import FunctionModel
 from dln_jax.models.latent_phase import ImageModel, LatentPhase
 from dln_jax.models.model import Model
 from dln_jax.models.uncertainty import Uncertainty, out_of_distribution, predictive

@@ -14,13 +14,14 @@ from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories
 from dln_jax.files import cache_folder
 from dln_jax.mechanics import closed_form, lagrangian
+from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.integrators import adaptive_rollout, second_order
 from dln_jax.precision import in_float64
-from dln_jax.scenes.datasets.letters import LETTERS, letter_path
+from dln_jax.scenes.datasets.letters import LETTERS, letter_path, require_finite
 from dln_jax.scenes.pendulums import joint_angles, two_link_arm
-from dln_jax.scenes.scene import Scene, actuation_matrix, closed_form_forward_dynamics
+from dln_jax.scenes.scene import Scene, closed_form_forward_dynamics
 from dln_jax.sizes import require_memory
-from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.types import InputError, require_seed
 
 CHARACTERS_TEST = ("e", "q", "v")
 """Test letters of the published protocol."""
@@ -49,7 +50,7 @@ def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Traject
     The outlines come from matplotlib's bundled font, smoothed. Angles, rates and torques follow exactly from the tip's
     path by inverse kinematics, differentiation and the closed-form equations of motion.
     """
-    _require(dt=dt)
+    require_finite(dt=dt)
     paths = [letter_path(letter) for letter in letters]
     times = [np.arange(0.0, path.duration, dt) for path in paths]
 
@@ -68,8 +69,8 @@ def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Traject
         return jax.vmap(motion)(t)
 
     # All letters use the longest duration and thus share a compilation; beyond its end a path rests.
-    longest = max(map(len, times))
-    motions = [states(path.position, dt * np.arange(longest)) for path in paths]
+    longest = dt * np.arange(max(map(len, times)))
+    motions = [states(path.position, longest) for path in paths]
     cut = [[np.asarray(values)[: len(t)] for values in motion] for motion, t in zip(motions, times, strict=True)]
     q, qd, qdd = map(np.concatenate, zip(*cut, strict=True))
     trajectory = np.repeat(np.arange(len(times)), [len(t) for t in times])
@@ -92,8 +93,8 @@ def uniform(
     Bounds are in rad or m, 1/s, 1/s² and N m or N. If the scene is fully actuated, accelerations are drawn; otherwise
     controls are drawn and accelerations follow from them.
     """
-    _require(samples=samples, position_bound=position_bound, rate_bound=rate_bound)
-    _require(acceleration_bound=acceleration_bound, control_bound=control_bound)
+    require_finite(samples=samples, position_bound=position_bound, rate_bound=rate_bound)
+    require_finite(acceleration_bound=acceleration_bound, control_bound=control_bound)
     require_seed(seed)
     _require_room(samples, scene)
     d = scene.needs.degrees_of_freedom
@@ -102,7 +103,7 @@ def uniform(
     if scene.needs.actuation is None:
         qdd = random.uniform(-acceleration_bound, acceleration_bound, (samples, d))
     else:
-        matrix = actuation_matrix(scene.needs)
+        matrix = jnp.asarray(scene.needs.actuation)
         control = random.uniform(-control_bound, control_bound, (samples, matrix.shape[1]))
         qdd = _batched(closed_form_forward_dynamics, scene)(q, qd, control @ matrix.T)
     order = np.arange(samples)
@@ -128,7 +129,7 @@ def free_swing(
     Raises:
         InputError: the integration does not finish.
     """
-    _require(trajectories=trajectories, steps=steps, dt=dt, tolerance=tolerance)
+    require_finite(trajectories=trajectories, steps=steps, dt=dt, tolerance=tolerance)
     require_seed(seed)
     _require_room(trajectories * steps, scene)
     if starts is None:
@@ -186,21 +187,12 @@ def completed(scene: Scene, t, q, qd, qdd, trajectory, label) -> Trajectories:
     def momentum(scene: Scene, q, qd, qdd):
         return jax.jvp(functools.partial(lagrangian.momentum, scene.lagrangian), (q, qd), (qd, qdd))
 
-    def forces(function):
-        return _batched(lambda scene, *state: function(scene.closed_form, *state), scene)(q, qd, qdd)
-
     # Compiled separately, since fusing them would change the last digits of the datasets.
-    tau, parts = np.asarray(forces(closed_form.inverse_dynamics)), map(np.asarray, forces(closed_form.decompose))
+    tau = np.asarray(_batched(closed_form.inverse_dynamics, scene.closed_form)(q, qd, qdd))
+    parts = map(np.asarray, _batched(closed_form.decompose, scene.closed_form)(q, qd, qdd))
     p, pd = map(np.asarray, _batched(momentum, scene)(q, qd, qdd))
     return Trajectories(t, q, qd, qdd, tau, trajectory, label, p, pd, *parts, needs=scene.needs)
 
 
-def _require(**numbers: int | float) -> None:
-    require_positive(**numbers)
-    for name, value in numbers.items():
-        if not np.isfinite(value):
-            raise InputError(f"{name} is {value}; expected a finite number")
-
-
-def _batched(function: Callable[..., Any], scene: Scene) -> Callable[..., Any]:
-    return jax.jit(jax.vmap(lambda *state: function(scene, *state)))
+def _batched(function: Callable[..., Any], system: Scene | ClosedForm) -> Callable[..., Any]:
+    return jax.jit(jax.vmap(functools.partial(function, system)))

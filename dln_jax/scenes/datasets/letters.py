@@ -16,7 +16,6 @@ The shapes come from the font's own integer coordinates, so they do not depend o
 
 import math
 from collections.abc import Callable
-from numbers import Real
 from pathlib import Path
 from typing import NamedTuple
 
@@ -53,30 +52,6 @@ class LetterPath(NamedTuple):
     """
 
 
-class _Stroke(NamedTuple):
-    """A curve over phase 0..1: a closed contour, or a straight pen-up move (whose harmonics are zero); all in m."""
-
-    cosines: Float[np.ndarray, "harmonics 2"]
-    """Coefficients of cos(2 pi k phase), k = 0, 1, ...."""
-    sines: Float[np.ndarray, "harmonics 2"]
-    displacement: Float[np.ndarray, "2"]
-    """End minus start; zero for a contour."""
-    length: float
-
-
-class _TimedStrokes(NamedTuple):
-    """All strokes of a letter, stacked, and their timing; times are relative to the duration."""
-
-    duration: Float[Array, ""]
-    starts: Float[Array, "strokes"]
-    shares: Float[Array, "strokes"]
-    ramps: Float[Array, "strokes"]
-    """Fraction of its own time during which a stroke speeds up, and again slows down; at most 1/2."""
-    cosines: Float[Array, "strokes harmonics 2"]
-    sines: Float[Array, "strokes harmonics 2"]
-    displacements: Float[Array, "strokes 2"]
-
-
 class _DesignUnits(TextToPath):
     """matplotlib's outlines at one pixel per font unit (1/2048 em), where coordinates are exact."""
 
@@ -92,10 +67,8 @@ def outline(character: str) -> list[Float[np.ndarray, "_ 2"]]:
         InputError: `character` is not a single printable character whose glyph has an outline.
     """
     expected = "expected one printable character with an outline in DejaVu Sans, such as 'a'"
-    if not isinstance(character, str):
+    if not isinstance(character, str) or len(character) != 1:
         raise InputError(f"character is {character!r}, a {type(character).__name__}; {expected}")
-    if len(character) != 1:
-        raise InputError(f"character is {character!r}, {len(character)} characters; {expected}")
     # By file, not by name: a name would match a user's font of that name first.
     file = str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf"))
     if not character.isprintable() or get_font(file).get_char_index(ord(character)) == 0:
@@ -118,8 +91,11 @@ def _contour(
     *,
     smoothing: float,
     bend_radius: float,
-) -> _Stroke:
-    """Returns the smooth stroke along a closed polygon, from its point nearest to the pen (`None`: top left)."""
+) -> tuple[Float[np.ndarray, "harmonics 2"], Float[np.ndarray, "harmonics 2"], float]:
+    """Returns the smooth stroke along a closed polygon, from its point nearest to the pen (`None`: top left).
+
+    The stroke is the coefficients of cos(2 pi k phase) and of sin(2 pi k phase), k = 0, 1, .., and its length, in m.
+    """
     corners = polygon @ np.array([1.0, 1.0j])
     arc = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(corners)))])
     uniform = np.arange(_SAMPLES) / _SAMPLES
@@ -143,13 +119,7 @@ def _contour(
     both = np.stack([by_phase.real, by_phase.imag], axis=-1)
     series = np.fft.rfft(both, axis=0)[: _HARMONICS + 1] * (2.0 / _SAMPLES)
     series[0] *= 0.5
-    return _Stroke(series.real, -series.imag, np.zeros(2), float(np.abs(np.diff(curve)).sum()))
-
-
-def _pen_up(start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> _Stroke:
-    cosines = np.zeros((_HARMONICS + 1, 2))
-    cosines[0] = start
-    return _Stroke(cosines, np.zeros_like(cosines), end - start, float(np.hypot(*(end - start))))
+    return series.real, -series.imag, float(np.abs(np.diff(curve)).sum())
 
 
 def _minimum_jerk_phase(time: Scalar, ramp: Scalar) -> Scalar:
@@ -163,14 +133,34 @@ def _minimum_jerk_phase(time: Scalar, ramp: Scalar) -> Scalar:
     return jnp.where(time > 0.5, 1.0 - phase, phase)
 
 
-def _position(letter: _TimedStrokes, time: Scalar) -> Float[Array, "2"]:
-    relative = jnp.clip(time / letter.duration, 0.0, 1.0)
-    stroke = jnp.sum(relative >= letter.starts[1:])
-    local = (relative - letter.starts[stroke]) / letter.shares[stroke]
-    phase = _minimum_jerk_phase(local, letter.ramps[stroke])
-    angles = 2.0 * jnp.pi * phase * jnp.arange(letter.cosines.shape[1])
-    periodic = jnp.cos(angles) @ letter.cosines[stroke] + jnp.sin(angles) @ letter.sines[stroke]
-    return periodic + phase * letter.displacements[stroke]
+def _position(
+    duration: Float[Array, ""],
+    starts: Float[Array, "strokes"],
+    shares: Float[Array, "strokes"],
+    ramps: Float[Array, "strokes"],
+    cosines: Float[Array, "strokes harmonics 2"],
+    sines: Float[Array, "strokes harmonics 2"],
+    displacements: Float[Array, "strokes 2"],
+    time: Scalar,
+) -> Float[Array, "2"]:
+    """Returns the tip at this time; `starts` and `shares` of the strokes are relative to the duration.
+
+    `ramps` are the fractions of its own time during which a stroke speeds up, and again slows down, at most 1/2.
+    """
+    relative = jnp.clip(time / duration, 0.0, 1.0)
+    stroke = jnp.sum(relative >= starts[1:])
+    local = (relative - starts[stroke]) / shares[stroke]
+    phase = _minimum_jerk_phase(local, ramps[stroke])
+    angles = 2.0 * jnp.pi * phase * jnp.arange(cosines.shape[1])
+    periodic = jnp.cos(angles) @ cosines[stroke] + jnp.sin(angles) @ sines[stroke]
+    return periodic + phase * displacements[stroke]
+
+
+def require_finite(**numbers: float) -> None:
+    """Raises `InputError` that names the first number that is not positive and finite."""
+    for name, value in numbers.items():
+        if not 0 < value < math.inf:
+            raise InputError(f"{name} is {value!r}; expected a finite number above 0")
 
 
 def letter_path(
@@ -198,32 +188,29 @@ def letter_path(
         InputError: the character has no outline, or a number is not finite or not positive.
     """
     polygons = outline(character)
-    lengths = dict(height=height, smoothing=smoothing, bend_radius=bend_radius, ramp_length=ramp_length)
-    for name, value in {"mean_speed": mean_speed, **lengths}.items():
-        if not (isinstance(value, Real) and math.isfinite(value) and value > 0.0):
-            raise InputError(f"{name} is {value!r}; expected a finite number above 0")
+    require_finite(height=height, mean_speed=mean_speed, smoothing=smoothing)
+    require_finite(bend_radius=bend_radius, ramp_length=ramp_length)
     if np.shape(centre) != (2,) or not np.all(np.isfinite(centre)):
         raise InputError(f"centre is {centre!r}; expected two finite numbers (x, y) in m")
 
     widths = np.concatenate(polygons)[:, 0]
     x_height = outline("x")[0][:, 1].max()
     middle = 0.5 * np.array([widths.min() + widths.max(), x_height])
-    strokes: list[_Stroke] = []
-    pen = None
+    strokes, pen = [], None
     for polygon in polygons:
         placed = (polygon - middle) * (height / x_height) + np.asarray(centre)
-        contour = _contour(placed, pen, smoothing=smoothing, bend_radius=bend_radius)
-        start = contour.cosines.sum(axis=0)
-        if pen is not None:
-            strokes.append(_pen_up(pen, start))
-        strokes.append(contour)
+        cosines, sines, length = _contour(placed, pen, smoothing=smoothing, bend_radius=bend_radius)
+        start = cosines.sum(axis=0)
+        if pen is not None:  # a straight pen-up move is a displacement without harmonics
+            at_pen = np.zeros_like(cosines)
+            at_pen[0] = pen
+            strokes.append((at_pen, np.zeros_like(sines), start - pen, float(np.hypot(*(start - pen)))))
+        strokes.append((cosines, sines, np.zeros(2), length))
         pen = start
 
-    way = np.array([stroke.length for stroke in strokes])
-    duration = float(way.sum() / mean_speed)
-    costs = way + ramp_length
+    cosines, sines, displacements, lengths = map(np.stack, zip(*strokes, strict=True))
+    duration = float(lengths.sum() / mean_speed)
+    costs = lengths + ramp_length
     shares = costs / costs.sum()
     times = duration, np.cumsum(shares) - shares, shares, np.minimum(ramp_length / costs, 0.5)
-    cosines, sines, displacements, _ = map(np.stack, zip(*strokes, strict=True))
-    timed = _TimedStrokes(*map(jnp.asarray, (*times, cosines, sines, displacements)))
-    return LetterPath(duration, Partial(_position, timed))
+    return LetterPath(duration, Partial(_position, *map(jnp.asarray, (*times, cosines, sines, displacements))))

@@ -45,7 +45,7 @@ def letters(request):
 
 def junctions(path):
     """Times when strokes begin, and the end: contours are strokes 0, 2, 4, ..."""
-    starts = np.asarray(path.position.args[0].starts) * path.duration
+    starts = np.asarray(path.position.args[1]) * path.duration
     return np.append(starts, path.duration)
 
 
@@ -124,7 +124,7 @@ def test_refuses_what_has_no_outline_and_wrong_numbers(monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
     for character, got in [
         (" ", "' ', an empty glyph"),
-        ("ab", "'ab', 2 characters"),
+        ("ab", "'ab', a str"),
         ("\n", "font lacks"),
         (3, "3, a int"),
     ]:
