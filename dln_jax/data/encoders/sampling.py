@@ -25,6 +25,8 @@ BRIDGED = 3.5
 """Gaps up to this multiple of the median step are interpolated; longer ones cut a trajectory."""
 EVEN = 1e-3
 """Samples are not resampled up to this relative deviation from equal steps."""
+DROPPED = ("p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
+"""Arrays of a log that are dropped when it is brought to equal steps."""
 ORDERS = (2, 3, 4, 5, 6)
 NORMAL = 0.67448975
 """Median absolute value of a standard normal variable."""
@@ -128,25 +130,26 @@ def held_at_equal_steps(data: Trajectories, rate: float | None = None) -> Trajec
         rate: rate of the equal steps, Hz (default: the median of the data).
     """
     rate = typical_rate(data) if rate is None else rate
-    columns: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "q", "tau", "trajectory")}
+    rows = []
     for piece in segments(data.t, data.trajectory, gap=BRIDGED):
         t, q, tau = data.t[piece], data.q[piece], data.tau[piece]
         times, positions = even(t, q, rate)
-        rows = times, positions, tau if positions is q else _mean_of_held(t, tau, times, 1 / rate)
-        for key, part in zip(columns, (*rows, np.full(len(times), data.trajectory[piece[0]])), strict=True):
-            columns[key].append(part)
-    joined = {key: np.concatenate(parts) for key, parts in columns.items()}
-    absent = np.full_like(joined["q"], np.nan)
-    others = dict.fromkeys(("p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity", "temperature"))
-    return data._replace(**joined, qd=absent, qdd=absent, **others)
+        if positions is not q:
+            tau = _mean_of_held(t, tau, times, 1 / rate)
+        rows.append((times, positions, tau, np.full(len(times), data.trajectory[piece[0]])))
+    t, q, tau, trajectory = map(np.concatenate, zip(*rows, strict=True))
+    absent = np.full_like(q, np.nan)
+    dropped = dict.fromkeys((*DROPPED, "temperature"))
+    return data._replace(t=t, q=q, qd=absent, qdd=absent, tau=tau, trajectory=trajectory, **dropped)
 
 
 def _mean_of_held(t: np.ndarray, values: np.ndarray, times: np.ndarray, step: float) -> np.ndarray:
     """Returns the mean over the step from each of `times` on; values are held to the next sample, the last for ever."""
+    from scipy.interpolate import BSpline
+
     ends = np.append(t, max(t[-1], times[-1]) + 2 * step)
-    integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(np.diff(ends)[:, None] * values, axis=0)])
-    at = [[np.interp(moments, ends, column) for column in integral.T] for moments in (times, times + step)]
-    return (np.array(at[1]) - np.array(at[0])).T / step
+    integral = BSpline(ends, values, 0).antiderivative()
+    return (integral(times + step) - integral(times)) / step
 
 
 def noise_of(values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"]) -> Float[np.ndarray, " k"]:
@@ -158,11 +161,12 @@ def noise_of(values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"]
     parts = [part for part in by_trajectory(values, trajectory) if len(part) > max(ORDERS)]
     if not parts:
         return np.full(values.shape[1], np.inf)
-    of_orders = []
+    smallest = step_of(values) / math.sqrt(12)
+    spreads = []
     for order in ORDERS:
-        changes = np.abs(np.concatenate([np.diff(part, n=order, axis=0) for part in parts]))
-        of_orders.append(np.median(changes, axis=0) / (NORMAL * math.sqrt(math.comb(2 * order, order))))
-    return np.maximum(np.min(of_orders, axis=0), step_of(values) / math.sqrt(12))
+        changes = np.concatenate([np.diff(part, n=order, axis=0) for part in parts])
+        spreads.append(np.median(abs(changes), axis=0) / (NORMAL * math.sqrt(math.comb(2 * order, order))))
+    return np.maximum(np.min(spreads, axis=0), smallest)
 
 
 def torque_noise(data: Trajectories) -> Float[np.ndarray, " d"] | None:
@@ -224,16 +228,12 @@ def delay_held(values: Float[np.ndarray, "N k"], samples: float) -> Float[np.nda
 def find_repeats(
     q: Float[np.ndarray, "N d"], tau: Float[np.ndarray, "N d"], trajectory: Int[np.ndarray, " N"]
 ) -> Repeats:
-    """Finds repeated samples of q and of tau; torques that never vary count as repeating with q."""
+    """Finds repeated samples of q and of tau; torques that never vary repeat with q."""
     of_q, after = _repeating(q, trajectory)
-    if not np.ptp(tau, axis=0).any():
-        return Repeats(of_q, of_q, after < LOST)
     of_tau, _ = _repeating(tau, trajectory)
     # A torque may be constant by itself, so a repeated row requires repeated coordinates.
-    same = np.r_[False, (np.diff(tau, axis=0) == 0).all(axis=1)]
-    of_tau = of_tau | (of_q & same)
-    both = of_q & of_tau
-    return Repeats(of_q, of_tau, bool(both.any() and np.array_equal(of_q, both)) and after < LOST)
+    of_tau |= of_q & np.r_[False, (np.diff(tau, axis=0) == 0).all(axis=1)]
+    return Repeats(of_q, of_tau, after < LOST and not (of_q & ~of_tau).any())
 
 
 def without_repeats(data: Trajectories) -> tuple[Trajectories, Repeats]:
@@ -243,7 +243,7 @@ def without_repeats(data: Trajectories) -> tuple[Trajectories, Repeats]:
     the same total. If q or tau repeat alone, they are interpolated.
     """
     repeats = find_repeats(data.q, data.tau, data.trajectory)
-    if not (repeats.q.any() or repeats.tau.any()):
+    if not (repeats.q | repeats.tau).any():
         return data, repeats
     t, trajectory = data.t, data.trajectory
     q = interpolate(t, data.q, trajectory, repeats.q & ~repeats.rows)
@@ -254,7 +254,10 @@ def without_repeats(data: Trajectories) -> tuple[Trajectories, Repeats]:
 
 
 def _repeating(values: np.ndarray, trajectory: np.ndarray) -> tuple[np.ndarray, float]:
-    """Mask of the rows that repeat the one before, and the size of the step after a repeat in usual steps."""
+    """Mask of the rows that repeat the one before, and the size of the step after a repeat in usual steps.
+
+    The size is infinite without repeats.
+    """
     repeating = np.zeros(len(values), bool)
     changes = np.diff(values, axis=0)
     inside = np.diff(trajectory) == 0
