@@ -76,11 +76,13 @@ def source_clock(data: Trajectories, interpolated: Bool[np.ndarray, " N"] | None
     period = _common_slope(t, joined.values())
     corrected = data.t.copy()
     for index, (rows, grid) in joined.items():
-        times, measured = t[rows].mean() + period * (grid - grid.mean()), known[rows]
+        times = t[rows].mean() + period * (grid - grid.mean())
+        measured = known[rows]
         own = np.flatnonzero(data.trajectory == index)
         stamps = data.t[own]
         # Equal steps between counted rows; stamps, shifted, before the first and after the last.
-        even, inside = np.interp(own, measured, times), np.clip(stamps, *data.t[measured[[0, -1]]])
+        even = np.interp(own, measured, times)
+        inside = np.clip(stamps, *data.t[measured[[0, -1]]])
         corrected[own] = np.where(stamps == inside, even, stamps + even - inside)
     return Clock(corrected, period, jitter) if np.abs(corrected - data.t).max() <= LATE else None
 

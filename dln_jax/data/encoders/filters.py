@@ -96,20 +96,13 @@ def gain(f: Float[np.ndarray, " n"], cutoff: float) -> Float[np.ndarray, " n"]:
     return 1 / (1 + (f / cutoff) ** (2 * ORDER))
 
 
-def low_pass(
-    values: Float[np.ndarray, "N k"],
-    *,
-    rate: float,
-    cutoff: float,
-    trajectory: Int[np.ndarray, " N"] | None = None,
-) -> Float[np.ndarray, "N k"]:
-    """Low-pass filters values at equal steps, every trajectory separately.
+def low_pass(values: Float[np.ndarray, "N k"], *, rate: float, cutoff: float) -> Float[np.ndarray, "N k"]:
+    """Low-pass filters values of one trajectory at equal steps.
 
     Args:
         values: columns of any quantity linear in the unknowns: torques, or columns of a regressor.
         rate: sampling rate, Hz.
         cutoff: Hz; infinite returns the values unchanged.
-        trajectory: trajectory of every sample (default: one).
 
     Raises:
         InputError: the cut-off is not below half the rate.
@@ -121,14 +114,9 @@ def low_pass(
         raise InputError(f"cutoff is {cutoff:g} Hz; expected less than {rate / 2:g} Hz, half the rate of the samples")
     from scipy.signal import butter, sosfiltfilt
 
-    sections = butter(ORDER, cutoff, fs=rate, output="sos")
-    extension = int(np.ceil(PERIODS * rate / cutoff))
-    filtered = []
-    for part in [values] if trajectory is None else by_trajectory(values, trajectory):
-        slow = _between_ends(part, int(np.ceil(END_PERIODS * rate / cutoff)))
-        rest = sosfiltfilt(sections, part - slow, axis=0, padlen=min(extension, len(part) - 1))
-        filtered.append(slow + rest)
-    return np.concatenate(filtered)
+    slow = _between_ends(values, int(np.ceil(END_PERIODS * rate / cutoff)))
+    extension = min(int(np.ceil(PERIODS * rate / cutoff)), len(values) - 1)
+    return slow + sosfiltfilt(butter(ORDER, cutoff, fs=rate, output="sos"), values - slow, axis=0, padlen=extension)
 
 
 def _between_ends(values: np.ndarray, near: int) -> np.ndarray:
@@ -193,15 +181,14 @@ def choose_cutoff(
     moves = (sizes > 0) & (q.std(axis=0) > MOVES * noise)
     if not moves.any():
         raise InputError("no joint moves by more than its noise, so no cut-off can be chosen; give one, or check q")
-    error = np.empty(CANDIDATES)
-    for place, cutoff in enumerate(tried):
-        H = gain(f, float(cutoff))[:, None]
+    errors = []
+    for cutoff in (*tried, np.inf):
+        H = gain(f, cutoff)[:, None]
         left = weight @ ((1 - H) ** 2 * signal + H**2 * floor)
-        error[place] = np.mean(left[moves] / sizes[moves])
-    best = int(np.argmin(error))
-    raw = np.mean((weight @ floor)[moves] / sizes[moves])
-    cutoff = float(tried[best]) if raw > WORTH**2 else np.inf
-    return Choice(cutoff, tried, error, f, spectrum, white)
+        errors.append(np.mean(left[moves] / sizes[moves]))
+    *error, raw = errors
+    cutoff = float(tried[np.argmin(error)]) if raw > WORTH**2 else np.inf
+    return Choice(cutoff, tried, np.array(error), f, spectrum, white)
 
 
 def _without_jumps(values: np.ndarray, trajectory: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -276,21 +263,19 @@ def _spectra(values: np.ndarray, trajectory: np.ndarray, *, rate: float) -> tupl
     if not parts:
         raise InputError("no segment has the 16 samples of a spectrum; record longer motions, or give a cut-off")
     length = min(max(len(part) for part in parts) - 2, max(14, round(SEGMENT * rate)))
-    total, weight = 0.0, 0
-    f = np.zeros(0)
+    f, powers = np.zeros(0), []
     for part in parts:
         changes = np.diff(part, n=2, axis=0)
-        if len(changes) < length:
-            changes = np.concatenate([changes, np.zeros((length - len(changes), changes.shape[1]))])
-        f, power = welch(changes, fs=rate, nperseg=length, axis=0)
-        total, weight = total + len(part) * power * (length / min(length, len(part) - 2)), weight + len(part)
-    power = np.asarray(total)[1:] / weight
+        padded = np.pad(changes, ((0, max(length - len(changes), 0)), (0, 0)))
+        f, power = welch(padded, fs=rate, nperseg=length, axis=0)
+        powers.append(len(part) * power[1:] * (length / min(length, len(changes))))  # zeros have no power
+    power = sum(powers) / sum(map(len, parts))
     return f[1:], power / (2 * np.sin(np.pi * f[1:, None] / rate)) ** 4
 
 
 def _mean(spectrum: np.ndarray) -> np.ndarray:
     """Mean of a spectrum [F, d] over a sixth of an octave on either side, which keeps lines."""
-    summed = np.concatenate([np.zeros((1, spectrum.shape[1])), np.cumsum(spectrum, axis=0)])
+    summed = np.pad(np.cumsum(spectrum, axis=0), ((1, 0), (0, 0)))
     low, high = _window(len(spectrum), 2 ** (-1 / 6), 2 ** (1 / 6))
     return (summed[high] - summed[low]) / (high - low)[:, None]
 

@@ -137,7 +137,7 @@ def smooth(
             f"no segment without a gap has {shortest} samples, four periods of the cut-off at {rate:g} Hz; record "
             "longer motions, or give a higher cut-off"
         )
-    columns: dict[str, list[np.ndarray]] = {}
+    parts: list[dict[str, np.ndarray]] = []
     for piece, t, x in long:
         q = low_pass(x[:, :d], rate=rate, cutoff=cutoff)
         qd, qdd = derivatives(q, rate=rate)
@@ -145,14 +145,12 @@ def smooth(
         arrays = {"t": t, "q": q, "qd": qd, "qdd": qdd, "tau": tau}
         if data.temperature is not None:
             slow = [np.interp(t, data.t[piece], column) for column in data.temperature[piece].T]
-            arrays["temperature"] = np.stack(slow, axis=1)
-        for key, array in arrays.items():
-            columns.setdefault(key, []).append(array[ends : len(t) - ends : decimate])
-    absent = dict.fromkeys(("p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity"))
+            arrays["temperature"] = np.transpose(slow)
+        parts.append({key: array[ends : len(t) - ends : decimate] for key, array in arrays.items()})
     smoothed = data._replace(
-        **absent,
-        **{key: np.concatenate(parts) for key, parts in columns.items()},
-        trajectory=np.repeat(np.arange(len(long)), [len(t) for t in columns["t"]]),
+        **dict.fromkeys(sampling.DROPPED),
+        **{key: np.concatenate([part[key] for part in parts]) for key in parts[0]},
+        trajectory=np.repeat(np.arange(len(long)), [len(part["t"]) for part in parts]),
         label=_labels(data, [int(data.trajectory[piece[0]]) for piece, _, _ in long]),
         estimated=tuple(key for key in data.estimated if key == "tau"),
     )
