@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.data.robot_xml import parse_robot
+from dln_jax.data.robot_xml import parse_robot, remove
 from dln_jax.data.robots import Robot, compile_robot, joint_names
 from dln_jax.files import write_bytes
 from dln_jax.mechanics.trees.description import Tree
@@ -149,7 +149,7 @@ def _into_urdf(
 ) -> None:
     links, joints = ({part.get("name"): part for part in root.findall(tag)} for tag in ("link", "joint"))
     for body in _moving(model, locked):
-        _remove_inertials(links[model.body(body).name])
+        remove(links[model.body(body).name], "inertial")
     for k, name in enumerate(tree.names):
         mass, centre, about = _about_centre(np.asarray(tree.inertias[k], float))
         inertial = ET.Element("inertial")
@@ -178,7 +178,7 @@ def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, constan
     bodies = [body for world in root.findall("worldbody") for body in world.iter("body")]  # in MuJoCo's order
     for body in _moving(model):
         element = bodies[body - 1]
-        _remove_inertials(element)
+        remove(element, "inertial")
         inertial = ET.Element("inertial", pos="0 0 0", mass="0", diaginertia="0 0 0")
         for k, joint in enumerate(_joints(element), model.body_jntadr[body]):
             theta = np.asarray(tree.inertias[k], float)
@@ -198,11 +198,6 @@ def _moving(model: Any, locked: Collection[str] = ()) -> list[int]:
         if body in free or model.body_parentid[body] in moving:
             moving.append(body)
     return moving
-
-
-def _remove_inertials(element: ET.Element) -> None:
-    for inertial in element.findall("inertial"):
-        element.remove(inertial)
 
 
 def _joints(element: ET.Element) -> Iterator[ET.Element]:
