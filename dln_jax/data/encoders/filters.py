@@ -60,6 +60,8 @@ JUMP = 8.0
 """A jump differs from its neighbours' prediction by more than this many standard deviations."""
 RARE = 0.1
 """Largest fraction of samples that can be jumps; more of them are a motion, or noise that is not white."""
+DEVIATION = np.array([-1, 6, -15, 20, -15, 6, -1]) / 20
+"""Weights of seven samples for the deviation of the middle one from the quintic through the others."""
 PREDICTION = math.sqrt(1 + 524 / 400)
 """Standard deviation of the prediction error, in units of the noise."""
 MEDIAN = math.log(2)
@@ -194,18 +196,16 @@ def choose_cutoff(
 def _without_jumps(values: np.ndarray, trajectory: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Interpolates rare samples of channels [N, k] that neither noise [k] nor the motion explains.
 
-    A sample is compared with the prediction of the quintic through three samples on either side, (1, -6, 15, 15, -6, 1)
-    / 20. It is a jump if the error is many standard deviations both of the noise and of such errors elsewhere.
+    A sample is compared with the prediction of the quintic through three samples on either side. It is a jump if the
+    error is many standard deviations both of the noise and of such errors elsewhere.
     """
     from scipy.interpolate import make_interp_spline
-    from scipy.ndimage import maximum_filter1d
+    from scipy.ndimage import correlate1d, maximum_filter1d
 
-    inside = np.flatnonzero(trajectory[6:] == trajectory[:-6]) + 3
-    if not len(inside):
+    inside = np.pad(trajectory[6:] == trajectory[:-6], 3)
+    if not inside.any():
         return values
-    sums = [values[inside - k] + values[inside + k] for k in (1, 2, 3)]
-    errors = np.zeros_like(values)
-    errors[inside] = np.abs(values[inside] - (15 * sums[0] - 6 * sums[1] + sums[2]) / 20)
+    errors = np.abs(correlate1d(values, DEVIATION, axis=0)) * inside[:, None]
     usual = np.maximum(PREDICTION * noise, np.median(errors[inside], axis=0) / NORMAL)
     # A jump also causes errors in neighbouring samples; only the largest error nearby counts.
     wrong = (errors > JUMP * usual) & (errors == maximum_filter1d(errors, 7, axis=0))
@@ -218,12 +218,9 @@ def _without_jumps(values: np.ndarray, trajectory: np.ndarray, noise: np.ndarray
 
 def _flat_top(f: np.ndarray, spectrum: np.ndarray) -> np.ndarray:
     """Level [d] of the upper half of a spectrum [F, d] that is flat, as white noise is; zero otherwise."""
-    parts = [np.median(part, axis=0) for part in np.array_split(spectrum[f > f[-1] / 2], 3) if len(part)]
-    if len(parts) < 3:
-        return np.zeros(spectrum.shape[1])
-    levels = np.array(parts)
-    flat = levels.max(axis=0) < FLAT * levels.min(axis=0)
-    return np.where(flat, levels.min(axis=0) / MEDIAN, 0.0)
+    levels = [np.median(part, axis=0) for part in np.array_split(spectrum[f > f[-1] / 2], 3)]
+    lowest = np.min(levels, axis=0)
+    return np.where(np.max(levels, axis=0) < FLAT * lowest, lowest / MEDIAN, 0.0)
 
 
 def _rising(f: np.ndarray, spectrum: np.ndarray, white: np.ndarray) -> np.ndarray:
@@ -239,7 +236,7 @@ def _rising(f: np.ndarray, spectrum: np.ndarray, white: np.ndarray) -> np.ndarra
     envelopes = _highest(f[:, None] ** 4 * _mean(spectrum), math.sqrt(1 / GAP), math.sqrt(GAP))
     rising = np.zeros_like(spectrum)
     for channel, (power, envelope) in enumerate(zip(accelerations.T, envelopes.T, strict=True)):
-        peak = int(np.argmax(power[f < f[-1] / 4])) if (f < f[-1] / 4).any() else 0
+        peak = int(np.argmax(power[f < f[-1] / 4]))
         lowest, of_envelope = (peak + int(np.argmin(values[peak:])) for values in (power, envelope))
         if math.sqrt(GAP) * f[lowest] < f[of_envelope]:  # a gap
             lowest = of_envelope
@@ -252,7 +249,7 @@ def _rising(f: np.ndarray, spectrum: np.ndarray, white: np.ndarray) -> np.ndarra
 
 
 def _spectra(values: np.ndarray, trajectory: np.ndarray, *, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Positive frequencies [F], Hz, and power spectra [F, k] of channels [N, k], unit² / Hz, averaged over segments.
+    """Positive frequencies [F], Hz, F >= 7, and power spectra [F, k] of channels [N, k], unit² / Hz, over segments.
 
     Raises:
         InputError: no trajectory has sixteen samples.

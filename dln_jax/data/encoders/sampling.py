@@ -272,13 +272,13 @@ def _repeating(values: np.ndarray, trajectory: np.ndarray) -> tuple[np.ndarray, 
     along, usual_squared = 0.0, 0.0
     for first, last in np.flatnonzero(np.diff(np.r_[0, same.astype(int), 0])).reshape(-1, 2):
         # Samples first + 1 to last repeat sample first; the changes before and after may end other repeats.
-        place = int(np.searchsorted(moves, first))
-        if not 0 < place < len(moves) - 1 or last - first > LONGEST:
+        later = np.searchsorted(moves, last + 1)
+        if first == 0 or later == len(moves) or last - first > LONGEST:
             continue
-        before, after = moves[place - 1], moves[place + 1]
-        if after - before > 3 * LONGEST or not inside[before : after + 1].all():
+        after = moves[later]
+        if after - first >= 3 * LONGEST or not inside[first - 1 : after + 1].all():
             continue
-        usual, ending, following = changes[before], changes[last], changes[after]
+        usual, ending, following = changes[first - 1], changes[last], changes[after]
         smaller = np.minimum(usual * np.sign(ending), following * np.sign(ending))
         moving = (np.abs(ending) > CLEAR * levels) & (smaller > COMPARABLE * np.abs(ending) / (last - first + 1))
         # Noise without levels never repeats exactly.

@@ -107,7 +107,7 @@ def smooth(
     if trim is not None and not trim >= 0:
         raise InputError(f"trim is {trim}; expected seconds >= 0")
     data, repeats = without_repeats(data)
-    of_q = (repeats.q & ~repeats.rows)[~repeats.rows]
+    of_q = repeats.q[~repeats.rows]
     clock = source_clock(data, of_q)
     if clock is not None:
         data = data._replace(t=clock.t, q=interpolate(clock.t, data.q, data.trajectory, of_q))
@@ -156,9 +156,20 @@ def smooth(
     )
     share = np.sqrt(min(1.0, 2 * cutoff / rate)) if filtered else 1.0
     return Smoothed(
-        smoothed, cutoff, rate, noise_q, noise_tau * share, choice, filtered, decimate, trim, len(long),
-        left_out=len(pieces) - len(long), repeats=repeats, clock=clock,
-    )  # fmt: skip
+        smoothed,
+        cutoff,
+        rate,
+        noise_q,
+        noise_tau * share,
+        choice,
+        filtered,
+        decimate,
+        trim,
+        len(long),
+        left_out=len(pieces) - len(long),
+        repeats=repeats,
+        clock=clock,
+    )
 
 
 def _labels(data: Trajectories, sources: list[int]) -> np.ndarray:
@@ -202,13 +213,14 @@ def smooth_locally(data: Trajectories) -> LocalRates:
     most = min(MOST_POINTS, *map(len, parts))
     while (longer := 2 * int(np.ceil((GROWTH * sizes[-1] - 1) / 2)) + 1) <= most:
         sizes.append(longer)
-    fits = [
-        np.concatenate([_polynomials(data.t[part], data.q[part], min(size, most)) for part in parts], axis=1)
-        for size in sizes
-    ]
-    best = np.argmin([np.mean(left_out**2, axis=0) for _, _, _, left_out, _ in fits], axis=0)
-    chosen = np.stack([fits[size][..., joint] for joint, size in enumerate(best)], axis=2)
-    q, qd, qdd, _, variance = chosen
+    fits = np.array(
+        [
+            np.concatenate([_polynomials(data.t[part], data.q[part], min(size, most)) for part in parts], axis=1)
+            for size in sizes
+        ]
+    )
+    best = np.argmin(np.mean(fits[:, 3] ** 2, axis=1), axis=0)
+    q, qd, qdd, _, variance = np.moveaxis(fits[best, ..., np.arange(len(best))], 0, -1)
     rows = np.concatenate(parts)
     smoothed = select_samples(data, rows)._replace(q=q, qd=qd, qdd=qdd)
     return LocalRates(smoothed, np.sqrt(np.mean(variance, axis=0)), best > 0, rows)
@@ -224,7 +236,7 @@ def _polynomials(t: np.ndarray, q: np.ndarray, size: int) -> Float[np.ndarray, "
     unit = 0.5 * (t[-1] - t[0]) * size / len(t)
     powers = ((t[around] - t[:, None]) / unit)[..., None] ** np.arange(DEGREE + 1)
     # The normal equations are safe here: the matrices are small and times are scaled.
-    inverse = np.linalg.solve(powers.transpose(0, 2, 1) @ powers, powers.transpose(0, 2, 1))
+    inverse = np.linalg.solve(powers.mT @ powers, powers.mT)
     value, slope, bend = (np.einsum("ns,nsd->nd", inverse[:, order], q[around]) for order in range(3))
     own = 1 - inverse[np.arange(len(t)), 0, np.arange(len(t)) - first][:, None]
     residual = q - value
