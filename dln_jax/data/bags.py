@@ -91,9 +91,7 @@ def _read_one(
     remarks: list[str] = []
     messages = _messages(path, topics)
     for topic, rows in messages.items():
-        of_topic, of_stamps = _series(topic, rows)
-        series = {**of_topic, **series}
-        remarks += of_stamps
+        series = {**_series(topic, rows, remarks), **series}
     positioned = list(dict.fromkeys(joint for field, joint in series if field == "position"))
     if not positioned:
         raise InputError(f"no message of {', '.join(messages)} has names and positions; choose others: --topics")
@@ -113,18 +111,17 @@ def _read_one(
     if 0 < len(there["velocity"]) < len(joints):
         remarks.append("velocities of some joints are missing; they are derived from q for all")
     complete = [field for field, names in there.items() if len(names) == len(joints)]
-    times, values, clock = _on_one_clock(
-        {(field, joint): series[field, joint] for field in complete for joint in joints}
-    )
+    series = {(field, joint): series[field, joint] for field in complete for joint in joints}
+    times, values = _on_one_clock(series, remarks)
     columns = {FIELDS[field]: np.stack([values[field, joint] for joint in joints], axis=1) for field in complete}
     names = np.array(list(joints.values()))
-    return {"t": 1e-9 * (times - times[0]), **columns, "joint_names": names}, [*remarks, *clock]
+    return {"t": 1e-9 * (times - times[0]), **columns, "joint_names": names}, remarks
 
 
 def _on_one_clock(
-    series: dict[tuple[str, str], Series],
-) -> tuple[np.ndarray, dict[tuple[str, str], np.ndarray], list[str]]:
-    """Stamps of the slowest series, values of all series there, and remarks, by the rules of the module.
+    series: dict[tuple[str, str], Series], remarks: list[str]
+) -> tuple[np.ndarray, dict[tuple[str, str], np.ndarray]]:
+    """Stamps of the slowest series and values of all series there, by the rules of the module; adds to the remarks.
 
     Raises:
         InputError: the series do not overlap in time.
@@ -154,16 +151,16 @@ def _on_one_clock(
         values[field, joint] = CubicSpline(t, known)(at) if cubic else np.interp(at, t, known)
         values[field, joint][equal] = known[np.isin(stamps, times)]
         exact &= bool(equal.all())
-    if exact and inside.all():
-        return times, values, []
-    rate = f"{1e9 / steps[key]:.4g} Hz" if np.isfinite(steps[key]) else "one message"
-    rule = "" if exact else "; q and qd by cubic splines between messages, tau linearly"
-    left = f"; {np.sum(~inside)} times without near messages of all joints are left out" * (not inside.all())
-    return times, values, [f"clock: stamps of {key[0]} of {key[1]} in {topic}, {rate}{rule}{left}"]
+    if not exact or not inside.all():
+        rate = f"{1e9 / steps[key]:.4g} Hz" if np.isfinite(steps[key]) else "one message"
+        rule = "" if exact else "; q and qd by cubic splines between messages, tau linearly"
+        left = f"; {np.sum(~inside)} times without near messages of all joints are left out" * (not inside.all())
+        remarks.append(f"clock: stamps of {key[0]} of {key[1]} in {topic}, {rate}{rule}{left}")
+    return times, values
 
 
-def _series(topic: str, rows: Sequence[tuple[int, Any]]) -> tuple[dict[tuple[str, str], Series], list[str]]:
-    """Sorted series of a topic by field and joint, from (time of receipt in ns, message), and remarks on stamps."""
+def _series(topic: str, rows: Sequence[tuple[int, Any]], remarks: list[str]) -> dict[tuple[str, str], Series]:
+    """Sorted series of a topic by field and joint, from (time of receipt in ns, message); adds to the remarks."""
     columns: dict[tuple[str, str], list[tuple[int, float]]] = {}
     for number, (_, message) in enumerate(rows):
         names = list(message.name)
@@ -178,7 +175,7 @@ def _series(topic: str, rows: Sequence[tuple[int, Any]]) -> tuple[dict[tuple[str
                 if np.isfinite(value):
                     columns.setdefault((field, joint), []).append((number, float(value)))
     stamps = [message.header.stamp for _, message in rows]
-    times, remarks = np.array([stamp.sec * 1_000_000_000 + stamp.nanosec for stamp in stamps], np.int64), []
+    times = np.array([stamp.sec * 1_000_000_000 + stamp.nanosec for stamp in stamps], np.int64)
     if not times.all() or (np.diff(times) < -RESTART).any():
         why = "some messages have no stamp" if not times.all() else "stamps jump back by more than 1 s"
         remarks.append(f"{topic}: {why}; times of receipt are used")
@@ -195,7 +192,7 @@ def _series(topic: str, rows: Sequence[tuple[int, Any]]) -> tuple[dict[tuple[str
         remarks.append(f"{topic}: {max(repeated)} messages repeat a stamp (the first is kept)")
     if any(backward):
         remarks.append(f"{topic}: {max(backward)} messages are earlier than the one before (sorted by stamp)")
-    return series, remarks
+    return series
 
 
 def _messages(path: Path, topics: Sequence[str]) -> dict[str, list[tuple[int, Any]]]:

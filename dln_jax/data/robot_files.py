@@ -48,7 +48,7 @@ def mjcf(robot: Robot, *, time_step: float = 0.001) -> str:
     ET.SubElement(ET.SubElement(root, "option", settings), "flag", contact="disable")
     world, motors = ET.SubElement(root, "worldbody"), ET.SubElement(root, "actuator")
     bodies: list[ET.Element] = []
-    armature, coupled = single_motors(tree.armature)
+    armature, coupled = _motors(tree)
     numbers = {"armature": armature, "damping": robot.damping, "frictionloss": robot.coulomb}
     for link, (name, parent) in enumerate(zip(names, tree.parents, strict=True)):
         theta, turn = np.asarray(tree.inertias[link], float), np.asarray(tree.rotations[link])
@@ -68,7 +68,7 @@ def mjcf(robot: Robot, *, time_step: float = 0.001) -> str:
         kind = "hinge" if tree.joints[link] == "revolute" else "slide"
         ET.SubElement(bodies[-1], "joint", {"name": name, "type": kind, "axis": _text(tree.axes[link]), **stated})
         ET.SubElement(motors, "motor", name=f"motor_{name}", joint=name)
-    _tendons(root, names, [(c, {"armature": inertia}) for inertia, c in coupled])
+    _tendons(root, names, coupled)
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
 
@@ -119,17 +119,17 @@ def write_robot(
         where = ", ".join(f"{name} at {position!r}" for name, position in locked.items())
         comment.append(f"Locked during identification, and part of the link before (rad or m): {where}.")
     losses = {key: values for key, values in (("damping", damping), ("frictionloss", coulomb)) if values is not None}
-    losses, of_motors = _split(motors, losses)
-    armature, coupled = single_motors(tree.armature)
+    armature, coupled = _motors(tree)
+    losses, others = _split(motors, losses)
+    coupled = [*others, *coupled]
     if root.tag == "robot":
         if np.any(armature):
             numbers = ", ".join(f"{name} {_text(value)}" for name, value in zip(names, armature, strict=True))
             comment.append(f"Armature, which URDF cannot state (kg m² or kg): {numbers}.")
-        for inertia, c in coupled:
-            comment.append(f"Armature of a motor at {_sum(c, names)}, which URDF lacks: {_text(inertia)}.")
-        for c, constants in of_motors:
+        for coefficients, constants in coupled:
+            speed = " + ".join(f"{_text(c)} {name}" for c, name in zip(coefficients, names, strict=True) if c)
             stated = ", ".join(f"{key} {_text(value)}" for key, value in constants.items())
-            comment.append(f"Friction of a motor at {_sum(c, names)}, likewise: {stated}.")
+            comment.append(f"URDF cannot state the motor that turns at {speed}: {stated}.")
         _into_urdf(root, model, tree, locked, losses)
     else:
         if locked:
@@ -137,7 +137,7 @@ def write_robot(
                 f"{original}: bodies behind the locked joints of an MJCF file would have no mass; remove these joints"
             )
         _into_mjcf(original, root, model, tree, {"armature": armature, **losses})
-        _tendons(root, names, [*of_motors, *((c, {"armature": inertia}) for inertia, c in coupled)])
+        _tendons(root, names, coupled)
     top = ET.Comment("\n  " + "\n  ".join(line.replace("--", "- -") for line in comment) + "\n")
     top.tail = "\n"
     root.insert(0, top)
@@ -209,6 +209,12 @@ def _joints(element: ET.Element) -> Iterator[ET.Element]:
             yield from _joints(part)
 
 
+def _motors(tree: Tree) -> tuple[np.ndarray, list[Motor]]:
+    """Armatures of the joints, and the motors that turn with several joints."""
+    armature, coupled = single_motors(tree.armature)
+    return armature, [(coefficients, {"armature": inertia}) for inertia, coefficients in coupled]
+
+
 def _split(motors: Any, losses: dict[str, Any]) -> tuple[dict[str, Any], list[Motor]]:
     """Friction of joints with a motor of their own, and that of all other motors."""
     if motors is None:
@@ -238,11 +244,6 @@ def _tendons(root: ET.Element, names: Sequence[str], motors: Sequence[Motor]) ->
         for name, coefficient in zip(names, coefficients, strict=True):
             if coefficient:
                 ET.SubElement(tendon, "joint", joint=name, coef=_text(coefficient))
-
-
-def _sum(coefficients: np.ndarray, names: Sequence[str]) -> str:
-    """The rate of a motor in words."""
-    return " + ".join(f"{_text(c)} {name}" for c, name in zip(coefficients, names, strict=True) if c)
 
 
 def _mjcf_inertial(theta: np.ndarray) -> ET.Element:

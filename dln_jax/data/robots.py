@@ -231,25 +231,29 @@ def robot_of(model: Any, locked: Mapping[str, float], stated: Mapping[str, np.nd
             theta = np.asarray(inertial_parameters(model.body_mass[body], model.body_ipos[body], about))
         else:
             theta = stated.get(model.body(body).name, np.zeros(10))
-        if parent >= 0 and theta.any():
-            inertias[parent] = inertias[parent] + moved(theta, R, p)
+        if parent >= 0:
+            inertias[parent] += moved(theta, R, p)
     names = tuple(names[joint] for joint in moving)
     masses = [theta[0] for theta in inertias]
-    parents, joints, rotations, positions, axes = zip(*links, strict=True)
     for link in reversed(range(len(links))):  # parents come before their children
-        if parents[link] >= 0:
-            masses[parents[link]] += masses[link]
+        if (parent := links[link][0]) >= 0:
+            masses[parent] += masses[link]
     if not all(masses):
         name = names[masses.index(0)]
         raise InputError(f"joint '{name}' moves no mass; expected an <inertial> for the link behind it")
-    dofs, infinite = model.jnt_dofadr[moving], np.array([-np.inf, np.inf])
+    gravity = np.asarray(model.opt.gravity)
     tree = make_tree(
-        parents, joints, rotations, positions, axes, inertias,
-        armature=_armature(model, moving), gravity=np.asarray(model.opt.gravity), names=names,
-    )  # fmt: skip
-    ranges = np.where(np.asarray(model.jnt_limited, bool)[moving, None], model.jnt_range[moving], infinite)
-    forces = np.where(np.asarray(model.jnt_actfrclimited, bool)[moving, None], model.jnt_actfrcrange[moving], infinite)
-    robot = Robot(tree, model.dof_damping[dofs], model.dof_frictionloss[dofs], ranges, forces)
+        *zip(*links, strict=True), inertias=inertias, armature=_armature(model, moving), gravity=gravity, names=names
+    )
+    positions, forces = (
+        np.where(np.asarray(limited, bool)[moving, None], limits[moving], [-np.inf, np.inf])
+        for limited, limits in (
+            (model.jnt_limited, model.jnt_range),
+            (model.jnt_actfrclimited, model.jnt_actfrcrange),
+        )
+    )
+    dofs = model.jnt_dofadr[moving]
+    robot = Robot(tree, model.dof_damping[dofs], model.dof_frictionloss[dofs], positions, forces)
     _require_numbers(robot)
     return robot
 
