@@ -185,6 +185,7 @@ def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, constan
             if theta.any():
                 # Move the parameters from the joint's anchor, the origin of the link's frame, to the body's frame.
                 inertial = _mjcf_inertial(np.asarray(moved(theta, np.eye(3), model.jnt_pos[k])))
+            joint.set("name", tree.names[k])  # tendons name their joints
             for key, values in constants.items():
                 joint.set(key, _text(values[k]))
         element.insert(0, inertial)
