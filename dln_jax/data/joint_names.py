@@ -26,13 +26,14 @@ def select_names(own: Sequence[str], stated: Sequence[str]) -> dict[str, str]:
     Raises:
         InputError: an unknown name, an empty one, or two joints with one name.
     """
-    pairs = [tuple(part.strip() for part in entry.partition("=")[::2]) for entry in stated]
-    renamed = {old: new if "=" in entry else old for entry, (old, new) in zip(stated, pairs, strict=True)}
-    for old, new in renamed.items():
+    renamed: dict[str, str] = {}
+    for entry in stated:
+        old, renames, new = map(str.strip, entry.partition("="))
         if old not in own:
             raise InputError(f"--joints: '{old:.60}' is not among the log's joints ({_listed(own)})")
-        if not new:
+        if renames and not new:
             raise InputError(f"--joints: '{old:.60}=' lacks a name; expected LOG=NEW")
+        renamed[old] = new or old
     kept = own if all("=" in entry for entry in stated) else renamed
     selected = {name: renamed.get(name, name) for name in kept}
     names = list(selected.values())

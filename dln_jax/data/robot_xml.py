@@ -15,7 +15,7 @@ import numpy as np
 
 from dln_jax.files import is_file, is_folder
 from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
-from dln_jax.types import InputError
+from dln_jax.types import InputError, require_once
 
 LARGEST = 64 * 2**20
 """Largest file, bytes."""
@@ -163,11 +163,9 @@ def check_joints(path: Path, root: ET.Element, locked: Collection[str]) -> None:
                 if zero and joint.get(switch) != "false" and joint.get("name") not in locked:
                     require_range(f"joint '{joint.get('name') or 'of a default class'}'", kind, stated)
         return
-    names = [joint.get("name", "") for joint in root.findall("joint")]
-    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
-        raise InputError(f"two joints are named '{twice[0]:.60}'; rename one")
-    joints = {joint.get("name", ""): joint for joint in root.findall("joint") if joint.get("type") != "fixed"}
-    moving = {name: joint for name, joint in joints.items() if name not in locked}
+    joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
+    require_once("the list of joints", [joint.get("name", "") for joint in root.findall("joint")])
+    moving = {name: joint for name, joint in joints.items() if joint.get("type") != "fixed" and name not in locked}
     if len(moving) > MOST_JOINTS:
         raise InputError(f"it has {len(moving)} joints that move; expected 1 to {MOST_JOINTS}")
     for name, joint in moving.items():

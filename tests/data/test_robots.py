@@ -193,7 +193,7 @@ REFUSED = (
     (urdf(ONE, SHOULDER.replace("revolute", "fixed")), "it has 0 joints"),
     (ARM.replace('type="continuous"', 'type="planar"'), "of type 'planar'"),
     (ARM.replace('type="continuous"', ""), "of type 'None'"),
-    (ARM.replace('joint name="elbow"', 'joint name="shoulder"'), "two joints are named"),
+    (ARM.replace('joint name="elbow"', 'joint name="shoulder"'), "names 'shoulder' twice; expected once"),
     (
         HINGE.replace('name="elbow" axis="0 1 0" {}', 'name="hip" type="ball"'),
         "joint 'hip' is a ball",

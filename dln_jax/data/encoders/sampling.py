@@ -221,7 +221,7 @@ def delay_held(values: Float[np.ndarray, "N k"], samples: float) -> Float[np.nda
         raise InputError(f"delay is {samples}; expected a number of samples, 0 or more")
     whole = int(samples)
     share = samples - whole
-    held = np.concatenate([np.zeros((whole + 1, values.shape[1])), values])[: len(values) + 1]
+    held = np.pad(values, ((whole + 1, 0), (0, 0)))[: len(values) + 1]
     return (1 - share) * held[1:] + share * held[:-1]
 
 
