@@ -30,17 +30,21 @@ RESTART = 1_000_000_000
 """Largest backward jump of stamps in ns (messages out of order); after a longer one, stamps are not used."""
 INSTALL = "pip install 'dln-jax[bag]'"
 
+Selection = Callable[[Sequence[str]], Mapping[str, str]]
+"""Names in the log -> the joints to keep, in their order, with their new names."""
+Quantity = tuple[str, str]
+"""A field and a joint."""
 Series = tuple[np.ndarray, np.ndarray, str]
 """One quantity of one joint: increasing stamps in ns, values, and the topic."""
 
 
-def read(path: Path, *, topics: Sequence[str], select: Callable[[Sequence[str]], Mapping[str, str]]) -> dict[str, Any]:
+def read(path: Path, *, topics: Sequence[str], select: Selection) -> dict[str, Any]:
     """Reads a bag, or every bag in a folder as a trajectory: arrays by schema key.
 
     Args:
         path: .db3, .mcap or .bag file, folder of a ROS 2 bag, or folder of bags.
         topics: topics to read; if quantities repeat, the first counts. Without any, the only topic of joint states.
-        select: names in the log -> the joints to keep, in their order, with their new names.
+        select: selects and renames joints.
 
     Raises:
         InputError: no rosbags, no bag, an absent or ambiguous topic, malformed messages, or no overlap in time.
@@ -83,11 +87,9 @@ def _paths(path: Path) -> list[Path]:
     return inside
 
 
-def _read_one(
-    path: Path, topics: Sequence[str], select: Callable[[Sequence[str]], Mapping[str, str]]
-) -> tuple[dict[str, np.ndarray], list[str]]:
+def _read_one(path: Path, topics: Sequence[str], select: Selection) -> tuple[dict[str, np.ndarray], list[str]]:
     """Arrays of one bag, and remarks."""
-    series: dict[tuple[str, str], Series] = {}
+    series: dict[Quantity, Series] = {}
     remarks: list[str] = []
     messages = _messages(path, topics)
     for topic, rows in messages.items():
@@ -118,9 +120,7 @@ def _read_one(
     return {"t": 1e-9 * (times - times[0]), **columns, "joint_names": names}, remarks
 
 
-def _on_one_clock(
-    series: dict[tuple[str, str], Series], remarks: list[str]
-) -> tuple[np.ndarray, dict[tuple[str, str], np.ndarray]]:
+def _on_one_clock(series: dict[Quantity, Series], remarks: list[str]) -> tuple[np.ndarray, dict[Quantity, np.ndarray]]:
     """Stamps of the slowest series and values of all series there, by the rules of the module; adds to the remarks.
 
     Raises:
@@ -159,9 +159,9 @@ def _on_one_clock(
     return times, values
 
 
-def _series(topic: str, rows: Sequence[tuple[int, Any]], remarks: list[str]) -> dict[tuple[str, str], Series]:
+def _series(topic: str, rows: Sequence[tuple[int, Any]], remarks: list[str]) -> dict[Quantity, Series]:
     """Sorted series of a topic by field and joint, from (time of receipt in ns, message); adds to the remarks."""
-    columns: dict[tuple[str, str], list[tuple[int, float]]] = {}
+    columns: dict[Quantity, list[tuple[int, float]]] = {}
     for number, (_, message) in enumerate(rows):
         names = list(message.name)
         require_once(f"message {number + 1} of {topic}", names)

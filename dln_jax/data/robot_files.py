@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dln_jax.data.robot_xml import parse_robot, remove
-from dln_jax.data.robots import Robot, compile_robot, joint_names
+from dln_jax.data.robots import Lock, Robot, compile_robot, joint_names
 from dln_jax.files import write_bytes
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.inertia import moved, parts, pseudo_inertia
@@ -81,7 +81,7 @@ def write_robot(
     damping: Any = None,
     coulomb: Any = None,
     motors: Any = None,
-    lock: Mapping[str, float] | Sequence[str] = (),
+    lock: Lock = (),
     remarks: tuple[str, ...] = (),
 ) -> None:
     """Writes a copy of `original` with the inertias and friction of a tree, and its armature if the format has it.

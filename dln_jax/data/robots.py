@@ -28,6 +28,8 @@ from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
 from dln_jax.types import InputError
 
 INSTALL = "pip install 'dln-jax[robot]'"
+Lock = Mapping[str, float] | Sequence[str]
+"""Joints that do not move: names, or positions by name, rad or m."""
 KINDS = ("free", "a ball", "prismatic", "revolute")
 """MuJoCo's kinds of joints, by their numbers."""
 EQUAL_JOINTS, OVER_JOINT = 2, 1
@@ -52,7 +54,7 @@ class Robot(NamedTuple):
     """[d], 1/s or m/s, or one for all; stated in URDF only, since MJCF has no such limit."""
 
 
-def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = ()) -> Robot:
+def read_robot(path: str | Path, *, lock: Lock = ()) -> Robot:
     """Reads a robot from a URDF or MJCF file.
 
     URDF inertias are read as stated, even if they are not physically consistent.
@@ -80,7 +82,7 @@ def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = 
 
 
 def compile_robot(
-    path: Path, root: ET.Element, lock: Mapping[str, float] | Sequence[str], *, inertias: bool = False
+    path: Path, root: ET.Element, lock: Lock, *, inertias: bool = False
 ) -> tuple[Any, Any, dict[str, float]]:
     """MuJoCo, its model of the file with this root element, and the positions of locked joints by name.
 
@@ -124,7 +126,7 @@ def require_ranges(model: Any, locked: Collection[str] = ()) -> None:
                 require_range(f"joint '{name}'", kind, [f"{limit:.15g}" for limit in limits])
 
 
-def _matching(lock: Mapping[str, float] | Sequence[str], names: Sequence[str]) -> dict[str, float]:
+def _matching(lock: Lock, names: Sequence[str]) -> dict[str, float]:
     """Positions of the locked joints by full name."""
     positions = lock if isinstance(lock, Mapping) else dict.fromkeys(lock, 0.0)
     locked: dict[str, float] = {}

@@ -36,7 +36,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from dln_jax.data.encoders.sampling import NORMAL, by_trajectory
+from dln_jax.data.encoders.sampling import NORMAL, by_trajectory, spline
 from dln_jax.types import InputError, require_positive
 
 ORDER = 4
@@ -149,11 +149,9 @@ def derivatives(
     require_positive(rate=rate)
     if len(q) < 6:
         raise InputError(f"a segment has {len(q)} samples; its rates take at least 6: record longer motions")
-    from scipy.interpolate import make_interp_spline
-
     t = np.arange(len(q)) / rate
-    spline = make_interp_spline(t, q, k=5, axis=0)
-    return spline(t, nu=1), spline(t, nu=2)
+    curve = spline(t, q, 5)
+    return curve(t, nu=1), curve(t, nu=2)
 
 
 def choose_cutoff(
@@ -199,7 +197,6 @@ def _without_jumps(values: np.ndarray, trajectory: np.ndarray, noise: np.ndarray
     A sample is compared with the prediction of the quintic through three samples on either side. It is a jump if the
     error is many standard deviations both of the noise and of such errors elsewhere.
     """
-    from scipy.interpolate import make_interp_spline
     from scipy.ndimage import correlate1d, maximum_filter1d
 
     inside = np.pad(trajectory[6:] == trajectory[:-6], 3)
@@ -212,7 +209,7 @@ def _without_jumps(values: np.ndarray, trajectory: np.ndarray, noise: np.ndarray
     values, places = values.copy(), np.arange(len(values))
     for channel in np.flatnonzero(wrong.any(axis=0) & (wrong.mean(axis=0) < RARE)):
         bad = wrong[:, channel]
-        values[bad, channel] = make_interp_spline(places[~bad], values[~bad, channel], k=5)(places[bad])
+        values[bad, channel] = spline(places[~bad], values[~bad, channel], 5)(places[bad])
     return values
 
 

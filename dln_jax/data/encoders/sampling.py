@@ -12,7 +12,7 @@ the usual distance, because the source is slower than the log's times claim.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -114,9 +114,14 @@ def even(
     uniform = t[0] + np.arange(count) / rate
     if count == len(t) and np.abs(t - uniform).max() * rate < EVEN:
         return uniform, values
+    return uniform, spline(t, values)(np.minimum(uniform, t[-1]))
+
+
+def spline(t: Float[np.ndarray, " n"], values: np.ndarray, degree: int = 3) -> Any:
+    """SciPy's spline through values [n, ..], of a lower degree if there are too few."""
     from scipy.interpolate import make_interp_spline
 
-    return uniform, make_interp_spline(t, values, k=min(3, len(t) - 1), axis=0)(np.minimum(uniform, t[-1]))
+    return make_interp_spline(t, values, k=min(degree, len(t) - 1))
 
 
 def held_at_equal_steps(data: Trajectories, rate: float | None = None) -> Trajectories:
@@ -296,13 +301,11 @@ def interpolate(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, wrong
     """Replaces the wrong samples by a cubic spline through the others of their trajectory."""
     if not wrong.any():
         return values
-    from scipy.interpolate import make_interp_spline
-
     values = values.copy()
     for index in np.unique(trajectory[wrong]):
         here = np.flatnonzero(trajectory == index)
         good, bad = here[~wrong[here]], here[wrong[here]]
-        values[bad] = make_interp_spline(t[good], values[good], k=min(3, len(good) - 1), axis=0)(t[bad])
+        values[bad] = spline(t[good], values[good])(t[bad])
     return values
 
 
