@@ -58,8 +58,8 @@ def with_selected_joints(arrays: dict[str, Any], joints: Sequence[str]) -> dict[
     places = [own.index(name) for name in selected]
     if "needs" in arrays and places != list(range(len(own))):
         raise InputError("--joints selects or reorders joints, but the file has needs for its own; leave --joints out")
-    present = {key: np.asarray(arrays[key]) for key in PER_JOINT if np.ndim(arrays.get(key)) == 2}
-    columns = {key: array[:, places] for key, array in present.items() if array.shape[1] == len(own)}
+    per_joint = [key for key in PER_JOINT if np.shape(arrays.get(key))[1:] == (len(own),)]
+    columns = {key: np.asarray(arrays[key])[:, places] for key in per_joint}
     return {**arrays, **columns, "joint_names": np.array(list(selected.values()))}
 
 

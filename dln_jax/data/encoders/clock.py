@@ -94,25 +94,28 @@ def _counted(t: np.ndarray, q: np.ndarray, qd: np.ndarray, inside: np.ndarray) -
     clearly more regular than the stamps.
     """
     size = np.mean(qd**2, axis=0)
-    weights = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
+    weights = 1 / np.where(size > 0, size, np.inf)
     v = (qd[1:] + qd[:-1]) / 2
     speed = v**2 @ weights
     moving = inside & (speed > MOVING**2 * np.sum(weights > 0))
     if moving.sum() < LEAST:
         return None
-    stamped, steps = np.diff(t), (np.diff(q, axis=0) * v) @ weights / np.where(speed > 0, speed, 1.0)
-    period = float(np.median(steps[moving]))
+    stamped = np.diff(t)[moving]
+    steps = ((np.diff(q, axis=0) * v) @ weights)[moving] / speed[moving]
+    period = float(np.median(steps))
     if not period > 0:
         return None
     whole = np.round(steps / period)
-    period = float(steps[moving].sum() / max(whole[moving].sum(), 1.0))
-    off, off_stamps = (np.abs(of / period - whole)[moving] for of in (steps, stamped))
-    regular = np.mean((off <= REGULAR) & (whole[moving] >= 1)) >= SHARE
-    same = abs(period * whole[moving].sum() / stamped[moving].sum() - 1) <= SAME
+    period = float(steps.sum() / max(whole.sum(), 1.0))
+    off, off_stamps = (np.abs(of / period - whole) for of in (steps, stamped))
+    regular = np.mean((off <= REGULAR) & (whole >= 1)) >= SHARE
+    same = abs(period * whole.sum() / stamped.sum() - 1) <= SAME
     jitter = float(np.sqrt(np.mean(off_stamps**2)))
     if not (regular and same and jitter >= JITTER and np.median(off) <= BETTER * np.median(off_stamps)):
         return None
-    return np.where(moving, np.maximum(whole, 0.0), 0.0), jitter
+    counts = np.zeros(len(moving))
+    counts[moving] = np.maximum(whole, 0.0)
+    return counts, jitter
 
 
 def _common_slope(t: np.ndarray, parts: Iterable[Counted]) -> float:
