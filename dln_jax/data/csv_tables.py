@@ -184,7 +184,7 @@ def _factor(title: str, key: str, unit: str | None, stated: str | None) -> float
                 f"'{title:.60}' has no unit; write it into the header, as in '{example}', or give --units si "
                 "(or degrees) for all titles without one"
             )
-        return known[STATED[stated][key]] if key in STATED[stated] else 1.0
+        return known.get(STATED[stated].get(key, ""), 1.0)
     if unit not in known:
         raise InputError(f"the unit of '{title:.60}' is not known; expected one of {', '.join(known)}")
     return known[unit]

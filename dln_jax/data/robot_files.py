@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.data.robot_xml import parse_robot, remove
+from dln_jax.data.robot_xml import MOMENTS, parse_robot, remove
 from dln_jax.data.robots import Lock, Robot, compile_robot, joint_names
 from dln_jax.files import write_bytes
 from dln_jax.mechanics.trees.description import Tree
@@ -155,8 +155,8 @@ def _into_urdf(
         inertial = ET.Element("inertial")
         ET.SubElement(inertial, "origin", xyz=_text(centre), rpy="0 0 0")
         ET.SubElement(inertial, "mass", value=_text(mass))
-        places = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-        ET.SubElement(inertial, "inertia", {key: _text(about[place]) for key, place in places.items()})
+        moments = zip(np.ravel(MOMENTS), about.ravel(), strict=True)
+        ET.SubElement(inertial, "inertia", {key: _text(moment) for key, moment in moments})
         body = model.jnt_bodyid[model.joint(name).id]
         links[model.body(body).name].insert(0, inertial)
         for key, values in losses.items():
@@ -249,7 +249,7 @@ def _tendons(root: ET.Element, names: Sequence[str], motors: Sequence[Motor]) ->
 
 def _mjcf_inertial(theta: np.ndarray) -> ET.Element:
     mass, centre, about = _about_centre(theta)
-    moments = _text(about[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
+    moments = _text([*np.diag(about), *about[np.triu_indices(3, 1)]])
     return ET.Element("inertial", mass=_text(mass), pos=_text(centre), fullinertia=moments)
 
 

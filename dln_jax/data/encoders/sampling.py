@@ -134,27 +134,24 @@ def held_at_equal_steps(data: Trajectories, rate: float | None = None) -> Trajec
         data: q, tau and the times of the samples.
         rate: rate of the equal steps, Hz (default: the median of the data).
     """
+    from scipy.interpolate import BSpline
+
     rate = typical_rate(data) if rate is None else rate
+    step = 1 / rate
     rows = []
     for piece in segments(data.t, data.trajectory, gap=BRIDGED):
         t, q, tau = data.t[piece], data.q[piece], data.tau[piece]
         times, positions = even(t, q, rate)
         if positions is not q:
-            tau = _mean_of_held(t, tau, times, 1 / rate)
+            # Values are held to the next sample, the last for ever.
+            ends = np.append(t, max(t[-1], times[-1]) + 2 * step)
+            integral = BSpline(ends, tau, 0).antiderivative()
+            tau = (integral(times + step) - integral(times)) / step
         rows.append((times, positions, tau, np.full(len(times), data.trajectory[piece[0]])))
     t, q, tau, trajectory = map(np.concatenate, zip(*rows, strict=True))
     absent = np.full_like(q, np.nan)
     dropped = dict.fromkeys((*DROPPED, "temperature"))
     return data._replace(t=t, q=q, qd=absent, qdd=absent, tau=tau, trajectory=trajectory, **dropped)
-
-
-def _mean_of_held(t: np.ndarray, values: np.ndarray, times: np.ndarray, step: float) -> np.ndarray:
-    """Returns the mean over the step from each of `times` on; values are held to the next sample, the last for ever."""
-    from scipy.interpolate import BSpline
-
-    ends = np.append(t, max(t[-1], times[-1]) + 2 * step)
-    integral = BSpline(ends, values, 0).antiderivative()
-    return (integral(times + step) - integral(times)) / step
 
 
 def noise_of(values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"]) -> Float[np.ndarray, " k"]:
