@@ -275,16 +275,16 @@ def _armature(model: Any, moving: list[int]) -> np.ndarray:
 
 def _require_numbers(robot: Robot) -> None:
     """Raises `InputError` for numbers out of the range of real robots."""
-    tree, d = robot.tree, robot.tree.degrees_of_freedom
+    tree = robot.tree
     armature = tree.armature if np.ndim(tree.armature) == 1 else np.diagonal(tree.armature)
-    frames = {"inertia": tree.inertias, "position": tree.positions, "rotation": tree.rotations, "axis": tree.axes}
     losses = {"damping": robot.damping, "dry friction": robot.coulomb, "armature": armature}
-    for what, stated in {**frames, "gravity": [tree.gravity] * d, **losses}.items():
-        least, wanted = (
-            (0, "zero or more") if what in losses else (-LARGEST_NUMBER, f"numbers up to {LARGEST_NUMBER:.0e}")
-        )
-        for name, numbers in zip(tree.names, np.reshape(stated, (d, -1)), strict=True):
+    frames = {"inertia": tree.inertias, "position": tree.positions, "rotation": tree.rotations, "axis": tree.axes}
+    for joint, name in enumerate(tree.names):
+        for what, stated in {**frames, "gravity": [tree.gravity] * len(tree.names), **losses}.items():
+            numbers = np.ravel(stated[joint])
+            least = 0.0 if what in losses else -LARGEST_NUMBER
             if not ((numbers >= least) & (numbers <= LARGEST_NUMBER)).all():
+                wanted = "zero or more" if what in losses else f"numbers up to {LARGEST_NUMBER:.0e}"
                 shown = ", ".join(f"{number:.3g}" for number in numbers)
                 raise InputError(f"the {what} of joint '{name}' is {shown}; expected {wanted}")
 

@@ -34,7 +34,7 @@ NEAR = 100
 LATE = 0.1
 """s: largest correction of a stamp."""
 
-Counted = tuple[np.ndarray, np.ndarray]
+Counts = tuple[np.ndarray, np.ndarray]
 """Indices of rows, and the whole number of periods from the first of them to each."""
 
 
@@ -67,9 +67,9 @@ def source_clock(data: Trajectories, interpolated: Bool[np.ndarray, " N"] | None
     if "qd" in data.estimated or len(known) <= LEAST:
         return None
     t, trajectory = data.t[known], data.trajectory[known]
-    if (counted := _counted(t, data.q[known], data.qd[known], np.diff(trajectory) == 0)) is None:
+    if (periods := _count_periods(t, data.q[known], data.qd[known], np.diff(trajectory) == 0)) is None:
         return None
-    whole, jitter = counted
+    whole, jitter = periods
     runs = np.flatnonzero(np.diff(np.r_[0, (whole > 0).astype(int), 0])).reshape(-1, 2)
     parts = [(np.arange(first, last + 1), np.r_[0.0, np.cumsum(whole[first:last])]) for first, last in runs]
     joined = _on_one_grid(t, trajectory, parts, _common_slope(t, parts))
@@ -87,7 +87,7 @@ def source_clock(data: Trajectories, interpolated: Bool[np.ndarray, " N"] | None
     return Clock(corrected, period, jitter) if np.abs(corrected - data.t).max() <= LATE else None
 
 
-def _counted(t: np.ndarray, q: np.ndarray, qd: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, float] | None:
+def _count_periods(t: np.ndarray, q: np.ndarray, qd: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, float] | None:
     """Returns the periods of each step, 0 where they cannot be counted, and the jitter of the stamps in periods.
 
     `inside` marks the steps [N - 1] within a trajectory. `None` if the steps are not whole numbers of periods, or not
@@ -118,19 +118,19 @@ def _counted(t: np.ndarray, q: np.ndarray, qd: np.ndarray, inside: np.ndarray) -
     return counts, jitter
 
 
-def _common_slope(t: np.ndarray, parts: Iterable[Counted]) -> float:
+def _common_slope(t: np.ndarray, parts: Iterable[Counts]) -> float:
     """Returns the period on the clock of the stamps: their common slope over the counts, by least squares."""
     centred = [(counts - counts.mean(), t[rows] - t[rows].mean()) for rows, counts in parts]
     return float(sum(counts @ stamps for counts, stamps in centred) / sum(counts @ counts for counts, _ in centred))
 
 
-def _on_one_grid(t: np.ndarray, trajectory: np.ndarray, parts: list[Counted], period: float) -> dict[int, Counted]:
+def _on_one_grid(t: np.ndarray, trajectory: np.ndarray, parts: list[Counts], period: float) -> dict[int, Counts]:
     """Returns one part per trajectory, with counts from one start, so that they are late as their stamps are.
 
     A run begins so many whole periods after the rows before it that the lateness of neighbouring rows agrees in the
     mean; over many rows the period is not yet accurate enough.
     """
-    joined: dict[int, Counted] = {}
+    joined: dict[int, Counts] = {}
     for rows, counts in parts:
         index = int(trajectory[rows[0]])
         if index in joined:
