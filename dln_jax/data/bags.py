@@ -30,17 +30,21 @@ RESTART = 1_000_000_000
 """Largest backward jump of stamps in ns (messages out of order); after a longer one, stamps are not used."""
 INSTALL = "pip install 'dln-jax[bag]'"
 
+Selection = Callable[[Sequence[str]], Mapping[str, str]]
+"""Names in the log -> the joints to keep, in their order, with their new names."""
+Quantity = tuple[str, str]
+"""A field and a joint."""
 Series = tuple[np.ndarray, np.ndarray, str]
 """One quantity of one joint: increasing stamps in ns, values, and the topic."""
 
 
-def read(path: Path, *, topics: Sequence[str], select: Callable[[Sequence[str]], Mapping[str, str]]) -> dict[str, Any]:
+def read(path: Path, *, topics: Sequence[str], select: Selection) -> dict[str, Any]:
     """Reads a bag, or every bag in a folder as a trajectory: arrays by schema key.
 
     Args:
         path: .db3, .mcap or .bag file, folder of a ROS 2 bag, or folder of bags.
         topics: topics to read; if quantities repeat, the first counts. Without any, the only topic of joint states.
-        select: names in the log -> the joints to keep, in their order, with their new names.
+        select: selects and renames joints.
 
     Raises:
         InputError: no rosbags, no bag, an absent or ambiguous topic, malformed messages, or no overlap in time.
@@ -59,11 +63,14 @@ def read(path: Path, *, topics: Sequence[str], select: Callable[[Sequence[str]],
         if (missing := {*first} ^ {*part}) or part["joint_names"].tolist() != first["joint_names"].tolist():
             what = f"{', '.join(sorted(missing))} only in one" if missing else "other joints"
             raise InputError(f"{bags[0].name} and {bag.name} differ ({what}); give bags of the same joints and fields")
-    arrays = {key: np.concatenate([part[key] for part in parts]) for key in first if key != "joint_names"}
-    trajectory = np.repeat(np.arange(len(parts)), [len(part["t"]) for part in parts])
-    label = np.array([bag.stem for bag in bags])
-    more = {"trajectory": trajectory, "label": label, "joint_names": first["joint_names"]}
-    return {**arrays, **more, "remarks": tuple(remarks)}
+    arrays = {key: np.concatenate([part[key] for part in parts]) for key in first}
+    return {
+        **arrays,
+        "trajectory": np.repeat(np.arange(len(parts)), [len(part["t"]) for part in parts]),
+        "label": np.array([bag.stem for bag in bags]),
+        "joint_names": first["joint_names"],
+        "remarks": tuple(remarks),
+    }
 
 
 def _paths(path: Path) -> list[Path]:
@@ -80,17 +87,13 @@ def _paths(path: Path) -> list[Path]:
     return inside
 
 
-def _read_one(
-    path: Path, topics: Sequence[str], select: Callable[[Sequence[str]], Mapping[str, str]]
-) -> tuple[dict[str, np.ndarray], list[str]]:
+def _read_one(path: Path, topics: Sequence[str], select: Selection) -> tuple[dict[str, np.ndarray], list[str]]:
     """Arrays of one bag, and remarks."""
-    series: dict[tuple[str, str], Series] = {}
+    series: dict[Quantity, Series] = {}
     remarks: list[str] = []
     messages = _messages(path, topics)
     for topic, rows in messages.items():
-        of_topic, of_stamps = _series(topic, rows)
-        series = {**of_topic, **series}
-        remarks += of_stamps
+        series = {**_series(topic, rows, remarks), **series}
     positioned = list(dict.fromkeys(joint for field, joint in series if field == "position"))
     if not positioned:
         raise InputError(f"no message of {', '.join(messages)} has names and positions; choose others: --topics")
@@ -110,19 +113,15 @@ def _read_one(
     if 0 < len(there["velocity"]) < len(joints):
         remarks.append("velocities of some joints are missing; they are derived from q for all")
     complete = [field for field, names in there.items() if len(names) == len(joints)]
-    times, values, clock = _on_one_clock(
-        {(field, joint): series[field, joint] for field in complete for joint in joints}
-    )
-    arrays = {"t": 1e-9 * (times - times[0])}
-    for field in complete:
-        arrays[FIELDS[field]] = np.stack([values[field, joint] for joint in joints], axis=1)
-    return {**arrays, "joint_names": np.array(list(joints.values()))}, [*remarks, *clock]
+    series = {(field, joint): series[field, joint] for field in complete for joint in joints}
+    times, values = _on_one_clock(series, remarks)
+    columns = {FIELDS[field]: np.stack([values[field, joint] for joint in joints], axis=1) for field in complete}
+    names = np.array(list(joints.values()))
+    return {"t": 1e-9 * (times - times[0]), **columns, "joint_names": names}, remarks
 
 
-def _on_one_clock(
-    series: dict[tuple[str, str], Series],
-) -> tuple[np.ndarray, dict[tuple[str, str], np.ndarray], list[str]]:
-    """Stamps of the slowest series, values of all series there, and remarks, by the rules of the module.
+def _on_one_clock(series: dict[Quantity, Series], remarks: list[str]) -> tuple[np.ndarray, dict[Quantity, np.ndarray]]:
+    """Stamps of the slowest series and values of all series there, by the rules of the module; adds to the remarks.
 
     Raises:
         InputError: the series do not overlap in time.
@@ -135,10 +134,8 @@ def _on_one_clock(
     inside = np.ones(len(clock), bool)
     for other, (stamps, _, _) in series.items():
         after = np.searchsorted(stamps, clock)
-        at = np.minimum(after, len(stamps) - 1)
-        around = (after > 0) & (after < len(stamps))
-        near = stamps[at] - stamps[np.maximum(at - 1, 0)] <= BRIDGED * steps[other]
-        inside &= (stamps[at] == clock) | (around & near)
+        gaps = np.r_[np.nan, np.diff(stamps), np.nan]  # before each message, and behind the last
+        inside &= np.isin(clock, stamps) | (gaps[after] <= BRIDGED * steps[other])
     times = clock[inside]
     if len(times) < 2:
         topics = ", ".join(sorted({own for _, _, own in series.values()}))
@@ -148,28 +145,24 @@ def _on_one_clock(
         )
     exact, values = True, {}
     for (field, joint), (stamps, known, _) in series.items():
-        places = np.minimum(np.searchsorted(stamps, times), len(stamps) - 1)
-        equal = stamps[places] == times
-        values[field, joint] = known[places]
-        if not equal.all():
-            exact = False
-            t, at = 1e-9 * (stamps - stamps[0]), 1e-9 * (times - stamps[0])
-            cubic = field != "effort" and len(t) > 3
-            between = CubicSpline(t, known)(at) if cubic else np.interp(at, t, known)
-            values[field, joint] = np.where(equal, known[places], between)
-    if exact and inside.all():
-        return times, values, []
-    rate = f"{1e9 / steps[key]:.4g} Hz" if np.isfinite(steps[key]) else "one message"
-    rule = "" if exact else "; q and qd by cubic splines between messages, tau linearly"
-    left = f"; {np.sum(~inside)} times without near messages of all joints are left out" * (not inside.all())
-    return times, values, [f"clock: stamps of {key[0]} of {key[1]} in {topic}, {rate}{rule}{left}"]
+        equal = np.isin(times, stamps)
+        t, at = 1e-9 * (stamps - stamps[0]), 1e-9 * (times - stamps[0])
+        cubic = field != "effort" and len(t) > 3 and not equal.all()
+        values[field, joint] = CubicSpline(t, known)(at) if cubic else np.interp(at, t, known)
+        values[field, joint][equal] = known[np.isin(stamps, times)]
+        exact &= bool(equal.all())
+    if not exact or not inside.all():
+        rate = f"{1e9 / steps[key]:.4g} Hz" if np.isfinite(steps[key]) else "one message"
+        rule = "" if exact else "; q and qd by cubic splines between messages, tau linearly"
+        left = f"; {np.sum(~inside)} times without near messages of all joints are left out" * (not inside.all())
+        remarks.append(f"clock: stamps of {key[0]} of {key[1]} in {topic}, {rate}{rule}{left}")
+    return times, values
 
 
-def _series(topic: str, rows: Sequence[tuple[int, Any]]) -> tuple[dict[tuple[str, str], Series], list[str]]:
-    """Sorted series of a topic by field and joint, from (time of receipt in ns, message), and remarks on stamps."""
-    stamps, columns = [], {}
+def _series(topic: str, rows: Sequence[tuple[int, Any]], remarks: list[str]) -> dict[Quantity, Series]:
+    """Sorted series of a topic by field and joint, from (time of receipt in ns, message); adds to the remarks."""
+    columns: dict[Quantity, list[tuple[int, float]]] = {}
     for number, (_, message) in enumerate(rows):
-        stamps.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
         names = list(message.name)
         require_once(f"message {number + 1} of {topic}", names)
         for field in FIELDS:
@@ -181,24 +174,25 @@ def _series(topic: str, rows: Sequence[tuple[int, Any]]) -> tuple[dict[tuple[str
             for joint, value in zip(names, values, strict=False):
                 if np.isfinite(value):
                     columns.setdefault((field, joint), []).append((number, float(value)))
-    times, remarks = np.array(stamps, np.int64), []
+    stamps = [message.header.stamp for _, message in rows]
+    times = np.array([stamp.sec * 1_000_000_000 + stamp.nanosec for stamp in stamps], np.int64)
     if not times.all() or (np.diff(times) < -RESTART).any():
         why = "some messages have no stamp" if not times.all() else "stamps jump back by more than 1 s"
         remarks.append(f"{topic}: {why}; times of receipt are used")
         times = np.array([receipt for receipt, _ in rows], np.int64)
-    series, repeated, backward = {}, 0, 0
+    series, repeated, backward = {}, [], []
     for key, column in columns.items():
-        numbers, values = (np.array(part) for part in zip(*column, strict=True))
+        numbers, values = np.transpose(column)
         own = times[numbers.astype(int)]
-        backward = max(backward, int(np.sum(np.diff(own) < 0)))
         distinct, first = np.unique(own, return_index=True)
-        repeated = max(repeated, len(own) - len(distinct))
         series[key] = distinct, values[first], topic
-    if repeated:
-        remarks.append(f"{topic}: {repeated} messages repeat a stamp (the first is kept)")
-    if backward:
-        remarks.append(f"{topic}: {backward} messages are earlier than the one before (sorted by stamp)")
-    return series, remarks
+        repeated.append(len(own) - len(distinct))
+        backward.append(np.sum(np.diff(own) < 0))
+    if any(repeated):
+        remarks.append(f"{topic}: {max(repeated)} messages repeat a stamp (the first is kept)")
+    if any(backward):
+        remarks.append(f"{topic}: {max(backward)} messages are earlier than the one before (sorted by stamp)")
+    return series
 
 
 def _messages(path: Path, topics: Sequence[str]) -> dict[str, list[tuple[int, Any]]]:

@@ -8,7 +8,6 @@ come in any order. Other columns are named, but not read.
 """
 
 import csv
-import itertools
 import math
 import re
 import warnings
@@ -85,7 +84,8 @@ def read(path: Path, *, units: str | None = None) -> dict[str, Any]:
         raise InputError("not a text file in UTF-8; export the log as CSV again") from None
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})") from None
-    bare = table[:, [place for place in places.get("q", ()) if columns[place][2] is None]]
+    positions = places.get("q", [])
+    bare = table[:, [place for place in positions if columns[place][2] is None]]
     if units == "degrees" and bare.size and (largest := float(np.abs(bare).max())) <= 2 * math.pi:
         raise InputError(
             f"--units degrees: q goes to {largest:.3g} at most, as angles in radians do; give --units si, or write "
@@ -95,7 +95,7 @@ def read(path: Path, *, units: str | None = None) -> dict[str, Any]:
     for key, own in places.items():
         values = np.stack([factors[place] * table[:, place] for place in own], axis=1)
         arrays[key] = values[:, 0] if key in ALONE else values
-    joints = [columns[place][1] for place in places.get("q", [])]
+    joints = [columns[place][1] for place in positions]
     if not all(joint.isdecimal() or not joint for joint in joints):
         arrays["joint_names"] = np.array(joints)
     return arrays
@@ -150,8 +150,9 @@ def _key_joint_unit(title: str) -> tuple[str, str, str | None] | None:
     unit = None
     while inside := _BRACKETS.fullmatch(rest):
         # q[2] names a joint, q2 [rad] a unit.
-        rest = f"{inside[1]} {inside[2]}" if inside[2].strip().isdecimal() else inside[1]
-        unit = unit if inside[2].strip().isdecimal() else _spelled(inside[2])
+        numbered = inside[2].strip().isdecimal()
+        rest = f"{inside[1]} {inside[2]}" if numbered else inside[1]
+        unit = unit if numbered else _spelled(inside[2])
     words = [word for word in re.split(r"[_ ]+", rest.strip("_ ./")) if word]
     for first in range(len(words) if unit is None else 0):
         if (suffix := _spelled("/".join(words[first:]))) in UNITS[key]:
@@ -183,7 +184,7 @@ def _factor(title: str, key: str, unit: str | None, stated: str | None) -> float
                 f"'{title:.60}' has no unit; write it into the header, as in '{example}', or give --units si "
                 "(or degrees) for all titles without one"
             )
-        return known[STATED[stated][key]] if key in STATED[stated] else 1.0
+        return known.get(STATED[stated].get(key, ""), 1.0)
     if unit not in known:
         raise InputError(f"the unit of '{title:.60}' is not known; expected one of {', '.join(known)}")
     return known[unit]
@@ -203,9 +204,10 @@ def _by_key(titles: Sequence[str], columns: dict[int, tuple[str, str, str | None
     for key, own in keys.items():
         if key in ALONE or not joints or (key == "temperature" and list(own) == [""]):
             continue
-        for name, there, absent in ((key, own, joints), ("q", joints, own)):
-            if missing := [joint for joint in absent if joint not in there]:
-                raise InputError(f"there is no column '{name}{missing[0]:.40}'; q and {key} must name the same joints")
+        for joint in (*joints, *own):
+            if joint not in own or joint not in joints:
+                name = "q" if joint in own else key
+                raise InputError(f"there is no column '{name}{joint:.40}'; q and {key} must name the same joints")
         keys[key] = {joint: own[joint] for joint in joints}
     return {key: list(own.values()) for key, own in keys.items()}
 
@@ -214,12 +216,20 @@ def _numbers(path: Path, titles: Sequence[str], read_places: set[int]) -> np.nda
     """All rows below the header [N, columns], with zeros in columns that are not read."""
     unread = set(range(len(titles))) - read_places
     converters: dict[int | str, Callable] = {**dict.fromkeys(unread, lambda _: 0.0)}
-    with path.open(encoding="utf-8-sig", newline="") as file, warnings.catch_warnings():
+    header, _ = next(_rows(path))
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about files without samples
-        lines = itertools.dropwhile(lambda line: not line.strip(), file)
-        next(csv.reader(lines))
         try:
-            table = np.loadtxt(lines, delimiter=",", comments=None, quotechar='"', converters=converters, ndmin=2)
+            table = np.loadtxt(
+                path,
+                delimiter=",",
+                comments=None,
+                quotechar='"',
+                converters=converters,
+                ndmin=2,
+                skiprows=header,
+                encoding="utf-8-sig",
+            )
         except (ValueError, OverflowError):
             table = None
     if table is None or (len(table) and table.shape[1] != len(titles)):

@@ -4,7 +4,6 @@ Names that differ from the robot's by one prefix or one ending are matched, such
 `elbow` and `elbow_joint`: replacing it must turn every name of the robot into one of the log, in exactly one way.
 """
 
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -27,13 +26,14 @@ def select_names(own: Sequence[str], stated: Sequence[str]) -> dict[str, str]:
     Raises:
         InputError: an unknown name, an empty one, or two joints with one name.
     """
-    pairs = [tuple(part.strip() for part in entry.partition("=")[::2]) for entry in stated]
-    renamed = {old: new if "=" in entry else old for entry, (old, new) in zip(stated, pairs, strict=True)}
-    for old, new in renamed.items():
+    renamed: dict[str, str] = {}
+    for entry in stated:
+        old, renames, new = map(str.strip, entry.partition("="))
         if old not in own:
             raise InputError(f"--joints: '{old:.60}' is not among the log's joints ({_listed(own)})")
-        if not new:
+        if renames and not new:
             raise InputError(f"--joints: '{old:.60}=' lacks a name; expected LOG=NEW")
+        renamed[old] = new or old
     kept = own if all("=" in entry for entry in stated) else renamed
     selected = {name: renamed.get(name, name) for name in kept}
     names = list(selected.values())
@@ -58,8 +58,8 @@ def with_selected_joints(arrays: dict[str, Any], joints: Sequence[str]) -> dict[
     places = [own.index(name) for name in selected]
     if "needs" in arrays and places != list(range(len(own))):
         raise InputError("--joints selects or reorders joints, but the file has needs for its own; leave --joints out")
-    present = {key: np.asarray(arrays[key]) for key in PER_JOINT if np.ndim(arrays.get(key)) == 2}
-    columns = {key: array[:, places] for key, array in present.items() if array.shape[1] == len(own)}
+    per_joint = [key for key in PER_JOINT if np.shape(arrays.get(key))[1:] == (len(own),)]
+    columns = {key: np.asarray(arrays[key])[:, places] for key in per_joint}
     return {**arrays, **columns, "joint_names": np.array(list(selected.values()))}
 
 
@@ -76,10 +76,9 @@ def match_names(own: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
     if set(wanted) <= set(own):
         return {name: name for name in wanted}
     options = _by_prefix(own, wanted)
-    for option in _by_prefix([name[::-1] for name in own], [name[::-1] for name in wanted]):
-        by_ending = {a[::-1]: b[::-1] for a, b in option.items()}
-        if by_ending not in options:
-            options.append(by_ending)
+    backwards = _by_prefix([name[::-1] for name in own], [name[::-1] for name in wanted])
+    by_ending = [{a[::-1]: b[::-1] for a, b in option.items()} for option in backwards]
+    options += [option for option in by_ending if option not in options]
     if len(options) == 1:
         return options[0]
     remedy = "state them: --joints LOG=ROBOT,LOG=ROBOT"
@@ -92,16 +91,15 @@ def match_names(own: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
 
 def _by_prefix(own: Sequence[str], wanted: Sequence[str]) -> list[dict[str, str]]:
     """Different matches by the replacement of one prefix, which leaves at least one character of every name."""
-    known = {name.casefold(): name for name in own}
+    known, first = {name.casefold(): name for name in own}, wanted[0].casefold()
     options = []
-    for name in own:
-        letters = zip(reversed(name.casefold()), reversed(wanted[0].casefold()), strict=False)
-        common = len(list(itertools.takewhile(lambda pair: pair[0] == pair[1], letters)))
-        there, here = len(name) - common, len(wanted[0]) - common
-        prefix, replaced = name[:there].casefold(), wanted[0][:here].casefold()
-        if not common or not all(other.casefold().startswith(replaced) and len(other) > here for other in wanted):
+    for name in known:
+        # The shortest replaced part, behind which the names agree.
+        here = next((k for k in range(len(first)) if name.endswith(first[k:])), len(first))
+        prefix, replaced = name.removesuffix(first[here:]), first[:here]
+        if not all(other.casefold().startswith(replaced) and len(other) > here for other in wanted):
             continue
-        option = {other: known.get(prefix + other[here:].casefold(), "") for other in wanted}
+        option = {other: known.get(prefix + other.casefold()[here:], "") for other in wanted}
         if all(option.values()) and option not in options:
             options.append(option)
     return options
@@ -125,16 +123,16 @@ def scale_torques(
     if isinstance(stated, Mapping):
         if unknown := [name for name in stated if name not in names]:
             raise InputError(f"--torque-factor: '{unknown[0]:.60}' is not among the log's joints ({_listed(names)})")
-        factors = [float(stated.get(name, 1.0)) for name in names]
+        factors = [stated.get(name, 1.0) for name in names]
     else:
-        factors = [float(stated)] * count if isinstance(stated, float | int) else [float(number) for number in stated]
+        factors = [stated] * count if isinstance(stated, float | int) else stated
     if len(factors) != count:
         raise InputError(f"--torque-factor has {len(factors)} numbers, the log {count} joints; give one, or all")
     if not all(factors):
         raise InputError("--torque-factor is zero; expected N m per unit of the log's efforts, negative to turn a sign")
     listed = ", ".join(f"{name} {factor:.4g}" for name, factor in zip(names, factors, strict=True))
     remarks = (*arrays.get("remarks", ()), f"tau is that of the log times {listed}")
-    return {**arrays, "tau": np.asarray(arrays["tau"]) * factors, "remarks": remarks}
+    return {**arrays, "tau": np.asarray(arrays["tau"]) * np.asarray(factors, float), "remarks": remarks}
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -4,7 +4,7 @@
 """
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int
@@ -15,20 +15,13 @@ from dln_jax.softbody.mesh.mesh import Mesh, make_mesh
 from dln_jax.types import InputError, require_positive
 
 KEYS = ("vertices", "elements", "held")
+Stored = tuple[Mesh, Int[np.ndarray, " k"] | None, tuple[str, ...]]
+"""A mesh, the indices of its fixed vertices (`None` if the file has none), and notes: what was left out, repaired or
+not read."""
 
 
-class StoredMesh(NamedTuple):
-    """Contents of a mesh file."""
-
-    mesh: Mesh
-    held: Int[np.ndarray, " k"] | None
-    """Indices of fixed vertices; `None` if the file has none."""
-    statements: tuple[str, ...] = ()
-    """Notes on parts that were left out or repaired, and keys that were not read; an npz file is never repaired."""
-
-
-def load(path: str | Path, scale: float = 1.0) -> StoredMesh:
-    """Reads and checks a file; never unpickles.
+def load(path: str | Path, scale: float = 1.0) -> Stored:
+    """Reads and checks a file; never unpickles. An npz file is never repaired.
 
     Args:
         path: path of an npz file, or of a file that `read_mesh` reads.
@@ -39,23 +32,21 @@ def load(path: str | Path, scale: float = 1.0) -> StoredMesh:
     """
     if Path(path).suffix.lower() in SUFFIXES:
         mesh, statements = read_mesh(path, scale=scale)
-        return StoredMesh(mesh, None, statements)
+        return mesh, None, statements
     require_positive(scale=scale)
-    stored = load_file(path, from_arrays, KEYS)
-    return stored._replace(mesh=stored.mesh._replace(vertices=scale * stored.mesh.vertices))
+    mesh, held, statements = load_file(path, from_arrays, KEYS)
+    return mesh._replace(vertices=scale * mesh.vertices), held, statements
 
 
-def from_arrays(arrays: dict[str, Any]) -> StoredMesh:
+def from_arrays(arrays: dict[str, Any]) -> Stored:
     """Checks the arrays of a mesh file; errors as for `load`."""
     for name in ("vertices", "elements"):
         if name not in arrays:
             keys = ", ".join({*arrays} - {UNREAD}) or "nothing"
             raise InputError(f"'{name}' is missing (found: {keys}); expected `vertices` and `elements`")
     mesh, held = make_mesh(arrays["vertices"], arrays["elements"]), arrays.get("held")
-    if held is None:
-        return StoredMesh(mesh, None, unread_line(arrays))
-    if held.ndim != 1 or held.dtype.kind not in "iu" or held.size == 0:
+    if held is not None and (held.ndim != 1 or held.dtype.kind not in "iu" or held.size == 0):
         raise InputError(
             f"held is {held.dtype} of shape {list(held.shape)}; expected integers [k], k >= 1: indices of vertices"
         )
-    return StoredMesh(mesh, held, unread_line(arrays))
+    return mesh, held, unread_line(arrays)

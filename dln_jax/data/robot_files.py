@@ -6,14 +6,14 @@ the joint moves, and no inertias in the bodies fixed to it. Quantities that the 
 
 import copy
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dln_jax.data.robot_xml import MOVING, parse_robot
-from dln_jax.data.robots import Robot, compile_robot, joint_names
+from dln_jax.data.robot_xml import MOMENTS, parse_robot, remove
+from dln_jax.data.robots import Lock, Robot, compile_robot, joint_names
 from dln_jax.files import write_bytes
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.inertia import moved, parts, pseudo_inertia
@@ -48,7 +48,8 @@ def mjcf(robot: Robot, *, time_step: float = 0.001) -> str:
     ET.SubElement(ET.SubElement(root, "option", settings), "flag", contact="disable")
     world, motors = ET.SubElement(root, "worldbody"), ET.SubElement(root, "actuator")
     bodies: list[ET.Element] = []
-    armature, coupled = single_motors(tree.armature)
+    armature, coupled = _motors(tree)
+    numbers = {"armature": armature, "damping": robot.damping, "frictionloss": robot.coulomb}
     for link, (name, parent) in enumerate(zip(names, tree.parents, strict=True)):
         theta, turn = np.asarray(tree.inertias[link], float), np.asarray(tree.rotations[link])
         if not theta[0] > 0:
@@ -60,7 +61,6 @@ def mjcf(robot: Robot, *, time_step: float = 0.001) -> str:
             place["xyaxes"] = _text(turn[:, :2].T)  # the first two columns keep all digits
         bodies.append(ET.SubElement(bodies[parent] if parent >= 0 else world, "body", place))
         bodies[-1].append(_mjcf_inertial(theta))
-        numbers = {"armature": armature, "damping": robot.damping, "frictionloss": robot.coulomb}
         stated = {key: _text(values[link]) for key, values in numbers.items()}
         for key, limits in (("range", robot.position_limits[link]), ("actuatorfrcrange", robot.force_limits[link])):
             if np.isfinite(limits).all():
@@ -68,7 +68,7 @@ def mjcf(robot: Robot, *, time_step: float = 0.001) -> str:
         kind = "hinge" if tree.joints[link] == "revolute" else "slide"
         ET.SubElement(bodies[-1], "joint", {"name": name, "type": kind, "axis": _text(tree.axes[link]), **stated})
         ET.SubElement(motors, "motor", name=f"motor_{name}", joint=name)
-    _tendons(root, names, [(c, {"armature": inertia}) for inertia, c in coupled])
+    _tendons(root, names, coupled)
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
 
@@ -81,7 +81,7 @@ def write_robot(
     damping: Any = None,
     coulomb: Any = None,
     motors: Any = None,
-    lock: Mapping[str, float] | Sequence[str] = (),
+    lock: Lock = (),
     remarks: tuple[str, ...] = (),
 ) -> None:
     """Writes a copy of `original` with the inertias and friction of a tree, and its armature if the format has it.
@@ -114,66 +114,58 @@ def write_robot(
     for name, theta in zip(names, np.asarray(tree.inertias, float), strict=True):
         if theta.any() and np.linalg.eigvalsh(pseudo_inertia(theta))[0] <= 0:
             raise InputError(f"the link behind joint '{name}' is not physically consistent; correct its inertia")
-    remarks = (LUMPS, *remarks)
+    comment = [LUMPS, *remarks]
     if locked:
         where = ", ".join(f"{name} at {position!r}" for name, position in locked.items())
-        remarks = (*remarks, f"Locked during identification, and part of the link before (rad or m): {where}.")
-    damping, coulomb, of_motors = _split(motors, damping, coulomb)
-    armature, coupled = single_motors(tree.armature)
-    friction = {"damping": damping, "coulomb": coulomb}
+        comment.append(f"Locked during identification, and part of the link before (rad or m): {where}.")
+    losses = {key: values for key, values in (("damping", damping), ("frictionloss", coulomb)) if values is not None}
+    armature, coupled = _motors(tree)
+    losses, others = _split(motors, losses)
+    coupled = [*others, *coupled]
     if root.tag == "robot":
         if np.any(armature):
             numbers = ", ".join(f"{name} {_text(value)}" for name, value in zip(names, armature, strict=True))
-            remarks = (*remarks, f"Armature, which URDF cannot state (kg m² or kg): {numbers}.")
-        for inertia, c in coupled:
-            remarks = (*remarks, f"Armature of a motor at {_sum(c, names)}, which URDF lacks: {_text(inertia)}.")
-        for c, losses in of_motors:
-            stated = ", ".join(f"{key} {_text(value)}" for key, value in losses.items())
-            remarks = (*remarks, f"Friction of a motor at {_sum(c, names)}, likewise: {stated}.")
-        _into_urdf(root, tree, locked, **friction)
+            comment.append(f"Armature, which URDF cannot state (kg m² or kg): {numbers}.")
+        for coefficients, constants in coupled:
+            speed = " + ".join(f"{_text(c)} {name}" for c, name in zip(coefficients, names, strict=True) if c)
+            stated = ", ".join(f"{key} {_text(value)}" for key, value in constants.items())
+            comment.append(f"URDF cannot state the motor that turns at {speed}: {stated}.")
+        _into_urdf(root, model, tree, locked, losses)
     else:
         if locked:
             raise InputError(
                 f"{original}: bodies behind the locked joints of an MJCF file would have no mass; remove these joints"
             )
-        _into_mjcf(original, root, model, tree._replace(armature=armature), **friction)
-        _tendons(root, names, [*of_motors, *((c, {"armature": inertia}) for inertia, c in coupled)])
-    comment = ET.Comment("\n  " + "\n  ".join(line.replace("--", "- -") for line in remarks) + "\n")
-    comment.tail = "\n"
-    root.insert(0, comment)
+        _into_mjcf(original, root, model, tree, {"armature": armature, **losses})
+        _tendons(root, names, coupled)
+    top = ET.Comment("\n  " + "\n  ".join(line.replace("--", "- -") for line in comment) + "\n")
+    top.tail = "\n"
+    root.insert(0, top)
     write_bytes(path, ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
 
 
-def _into_urdf(root: ET.Element, tree: Tree, locked: Collection[str], *, damping: Any, coulomb: Any) -> None:
-    links = {link.get("name"): link for link in root.findall("link")}
-    joints = {joint.get("name"): joint for joint in root.findall("joint")}
-    fixed: dict[Any, list[Any]] = {}
-    for joint in joints.values():
-        if joint.get("type") not in MOVING or joint.get("name") in locked:
-            fixed.setdefault(_link(joint, "parent"), []).append(_link(joint, "child"))
+def _into_urdf(
+    root: ET.Element, model: Any, tree: Tree, locked: Collection[str], losses: Mapping[str, np.ndarray]
+) -> None:
+    links, joints = ({part.get("name"): part for part in root.findall(tag)} for tag in ("link", "joint"))
+    for body in _moving(model, locked):
+        remove(links[model.body(body).name], "inertial")
     for k, name in enumerate(tree.names):
-        joint = joints[name]
-        child = _link(joint, "child")
-        lump = [child]
-        for rigid in lump:  # the list grows by the links fixed to each
-            lump.extend(fixed.get(rigid, ()))
-            for inertial in links[rigid].findall("inertial"):
-                links[rigid].remove(inertial)
         mass, centre, about = _about_centre(np.asarray(tree.inertias[k], float))
         inertial = ET.Element("inertial")
         ET.SubElement(inertial, "origin", xyz=_text(centre), rpy="0 0 0")
         ET.SubElement(inertial, "mass", value=_text(mass))
-        places = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-        ET.SubElement(inertial, "inertia", {key: _text(about[place]) for key, place in places.items()})
-        links[child].insert(0, inertial)
-        for key, values in (("damping", damping), ("friction", coulomb)):
-            if values is not None:
-                dynamics = joint.find("dynamics")
-                dynamics = ET.SubElement(joint, "dynamics") if dynamics is None else dynamics
-                dynamics.set(key, _text(values[k]))
+        moments = zip(np.ravel(MOMENTS), about.ravel(), strict=True)
+        ET.SubElement(inertial, "inertia", {key: _text(moment) for key, moment in moments})
+        body = model.jnt_bodyid[model.joint(name).id]
+        links[model.body(body).name].insert(0, inertial)
+        for key, values in losses.items():
+            dynamics = joints[name].find("dynamics")
+            dynamics = ET.SubElement(joints[name], "dynamics") if dynamics is None else dynamics
+            dynamics.set("friction" if key == "frictionloss" else key, _text(values[k]))
 
 
-def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, *, damping: Any, coulomb: Any) -> None:
+def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, constants: Mapping[str, np.ndarray]) -> None:
     for element in root.iter():
         if element.tag in ("include", "replicate", "attach", "composite", "flexcomp", "model"):
             raise InputError(
@@ -183,52 +175,59 @@ def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, *, damp
         # These settings would alter the inertias written below.
         for name in ("inertiafromgeom", "settotalmass", "boundmass", "boundinertia", "balanceinertia"):
             compiler.attrib.pop(name, None)
-    outer = {child: element for element in root.iter() for child in element}
-
-    def body_of(element: ET.Element) -> ET.Element:
-        """The body around an element, which may be in frames."""
-        while (element := outer[element]).tag == "frame":
-            pass
-        return element
-
-    worlds, joints_of, moving, k = root.findall("worldbody"), {}, set(), 0
-    for joint in (joint for world in worlds for joint in world.iter("joint")):
-        joints_of.setdefault(body_of(joint), []).append(joint)
-    for body in [body for world in worlds for body in world.iter("body")]:  # in MuJoCo's order
-        joints = joints_of.get(body, [])
-        if not (joints or body_of(body) in moving):
-            continue
-        moving.add(body)
-        for inertial in body.findall("inertial"):
-            body.remove(inertial)
+    bodies = [body for world in root.findall("worldbody") for body in world.iter("body")]  # in MuJoCo's order
+    for body in _moving(model):
+        element = bodies[body - 1]
+        remove(element, "inertial")
         inertial = ET.Element("inertial", pos="0 0 0", mass="0", diaginertia="0 0 0")
-        for joint in joints:
+        for k, joint in enumerate(_joints(element), model.body_jntadr[body]):
             theta = np.asarray(tree.inertias[k], float)
             if theta.any():
                 # Move the parameters from the joint's anchor, the origin of the link's frame, to the body's frame.
                 inertial = _mjcf_inertial(np.asarray(moved(theta, np.eye(3), model.jnt_pos[k])))
-            named = (("armature", tree.armature), ("damping", damping), ("frictionloss", coulomb))
-            for key, values in named:
-                if values is not None:
-                    joint.set(key, _text(values[k]))
-            k += 1
-        body.insert(0, inertial)
+            joint.set("name", tree.names[k])  # tendons name their joints
+            for key, values in constants.items():
+                joint.set(key, _text(values[k]))
+        element.insert(0, inertial)
 
 
-def _split(motors: Any, damping: Any, coulomb: Any) -> tuple[Any, Any, list[Motor]]:
+def _moving(model: Any, locked: Collection[str] = ()) -> list[int]:
+    """Bodies of a compiled model that move with a joint that is not locked."""
+    free = {model.jnt_bodyid[k] for k, name in enumerate(joint_names(model)) if name not in locked}
+    moving: list[int] = []
+    for body in range(1, model.nbody):  # parents come before their children
+        if body in free or model.body_parentid[body] in moving:
+            moving.append(body)
+    return moving
+
+
+def _joints(element: ET.Element) -> Iterator[ET.Element]:
+    """The joints of an MJCF body, also those in its frames."""
+    for part in element:
+        if part.tag == "joint":
+            yield part
+        elif part.tag == "frame":
+            yield from _joints(part)
+
+
+def _motors(tree: Tree) -> tuple[np.ndarray, list[Motor]]:
+    """Armatures of the joints, and the motors that turn with several joints."""
+    armature, coupled = single_motors(tree.armature)
+    return armature, [(coefficients, {"armature": inertia}) for inertia, coefficients in coupled]
+
+
+def _split(motors: Any, losses: dict[str, Any]) -> tuple[dict[str, Any], list[Motor]]:
     """Friction of joints with a motor of their own, and that of all other motors."""
     if motors is None:
-        return damping, coulomb, []
+        return losses, []
     S = np.asarray(motors, float)
     own = (np.eye(len(S)) == S).all(axis=1)
-    stated = {key: values for key, values in (("damping", damping), ("frictionloss", coulomb)) if values is not None}
     others = [
-        (S[k], {key: float(values[k]) for key, values in stated.items()})
+        (S[k], {key: float(values[k]) for key, values in losses.items()})
         for k in np.flatnonzero(~own)
-        if any(values[k] for values in stated.values())
+        if any(values[k] for values in losses.values())
     ]
-    first, second = (None if values is None else np.where(own, values, 0.0) for values in (damping, coulomb))
-    return first, second, others
+    return {key: np.where(own, values, 0.0) for key, values in losses.items()}, others
 
 
 def _tendons(root: ET.Element, names: Sequence[str], motors: Sequence[Motor]) -> None:
@@ -248,19 +247,9 @@ def _tendons(root: ET.Element, names: Sequence[str], motors: Sequence[Motor]) ->
                 ET.SubElement(tendon, "joint", joint=name, coef=_text(coefficient))
 
 
-def _sum(coefficients: np.ndarray, names: Sequence[str]) -> str:
-    """The rate of a motor in words."""
-    return " + ".join(f"{_text(c)} {name}" for c, name in zip(coefficients, names, strict=True) if c)
-
-
-def _link(joint: ET.Element, which: str) -> str | None:
-    element = joint.find(which)
-    return None if element is None else element.get("link")
-
-
 def _mjcf_inertial(theta: np.ndarray) -> ET.Element:
     mass, centre, about = _about_centre(theta)
-    moments = _text(about[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
+    moments = _text([*np.diag(about), *about[np.triu_indices(3, 1)]])
     return ET.Element("inertial", mass=_text(mass), pos=_text(centre), fullinertia=moments)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from dln_jax.files import is_file, is_folder
 from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
-from dln_jax.types import InputError
+from dln_jax.types import InputError, require_once
 
 LARGEST = 64 * 2**20
 """Largest file, bytes."""
@@ -28,9 +28,12 @@ REPEATING = ("replicate", "composite", "flexcomp")
 """MJCF elements that expand to many."""
 MOVING = ("revolute", "continuous", "prismatic")
 """URDF joint types that move."""
-NUMBERS = {"limit": ("lower", "upper"), "dynamics": ("damping", "friction")}
-"""Numeric attributes of the child elements of a URDF joint."""
+SIDES = ("lower", "upper")
+NUMBERS = {"limit": ("velocity", "effort", *SIDES), "dynamics": ("damping", "friction")}
+"""Numeric attributes of the child elements of a URDF joint; only those of `SIDES` may be negative."""
 MOMENTS = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
+PLACEHOLDER = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+"""Inertia that MuJoCo accepts, for links whose stated one is read without it."""
 REMEDY = "correct the file, or lock the joint"
 RANGES = {"range": ("position", "limited"), "actuatorfrcrange": ("torque", "actuatorfrclimited")}
 """Attributes of an MJCF joint that hold two numbers: what they limit, and the attributes that disable them."""
@@ -110,9 +113,7 @@ def link_inertias(root: ET.Element) -> dict[str, np.ndarray]:
         inertial, name = link.find("inertial"), link.get("name", "")
         if inertial is None:
             continue
-        origin, mass, inertia = (
-            {} if part is None else part.attrib for part in map(inertial.find, ("origin", "mass", "inertia"))
-        )
+        origin, mass, inertia = (_attributes(inertial, tag) for tag in ("origin", "mass", "inertia"))
         m = _number(mass.get("value", ""))
         moments = np.array([[_number(inertia.get(key, "")) for key in row] for row in MOMENTS])
         xyz, rpy = ([_number(text) for text in origin.get(key, "0 0 0").split()] for key in ("xyz", "rpy"))
@@ -130,21 +131,22 @@ def link_inertias(root: ET.Element) -> dict[str, np.ndarray]:
 def without_shapes(root: ET.Element, *, inertias: bool) -> ET.Element:
     """Prepares a URDF for MuJoCo: no shapes, every link a body of its own, and its inertias or ones MuJoCo accepts."""
     for link in root.iter("link"):
-        for part in [*link.findall("visual"), *link.findall("collision")]:
-            link.remove(part)
+        remove(link, "visual", "collision")
         if inertias:
             continue
-        for part in link.findall("inertial"):
-            link.remove(part)
-        inertial = ET.SubElement(link, "inertial")
-        ET.SubElement(inertial, "mass", value="1")
-        ET.SubElement(inertial, "inertia", ixx="1", ixy="0", ixz="0", iyy="1", iyz="0", izz="1")
+        remove(link, "inertial")
+        link.append(ET.fromstring(PLACEHOLDER))
     settings = root.find("mujoco")
     settings = ET.SubElement(root, "mujoco") if settings is None else settings
-    for part in settings.findall("compiler"):
-        settings.remove(part)
+    remove(settings, "compiler")
     ET.SubElement(settings, "compiler", fusestatic="false", balanceinertia="false")
     return root
+
+
+def remove(element: ET.Element, *tags: str) -> None:
+    """Removes the children with these tags."""
+    for part in [part for part in element if part.tag in tags]:
+        element.remove(part)
 
 
 def check_joints(path: Path, root: ET.Element, locked: Collection[str]) -> None:
@@ -161,11 +163,9 @@ def check_joints(path: Path, root: ET.Element, locked: Collection[str]) -> None:
                 if zero and joint.get(switch) != "false" and joint.get("name") not in locked:
                     require_range(f"joint '{joint.get('name') or 'of a default class'}'", kind, stated)
         return
-    names = [joint.get("name", "") for joint in root.findall("joint")]
-    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
-        raise InputError(f"two joints are named '{twice[0]:.60}'; rename one")
-    joints = {joint.get("name", ""): joint for joint in root.findall("joint") if joint.get("type") != "fixed"}
-    moving = {name: joint for name, joint in joints.items() if name not in locked}
+    joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
+    require_once("the list of joints", [joint.get("name", "") for joint in root.findall("joint")])
+    moving = {name: joint for name, joint in joints.items() if joint.get("type") != "fixed" and name not in locked}
     if len(moving) > MOST_JOINTS:
         raise InputError(f"it has {len(moving)} joints that move; expected 1 to {MOST_JOINTS}")
     for name, joint in moving.items():
@@ -174,20 +174,17 @@ def check_joints(path: Path, root: ET.Element, locked: Collection[str]) -> None:
             raise InputError(
                 f"joint '{name}' is of type '{kind}'; expected {', '.join(MOVING)} or fixed: lock it if it is still"
             )
-        limit, dynamics = ({} if part is None else part.attrib for part in map(joint.find, ("limit", "dynamics")))
-        sides = [limit.get(side, "") for side in ("lower", "upper")]
+        sides = [_attributes(joint, "limit").get(side, "") for side in SIDES]
         if kind != "continuous" and any(sides):
             require_range(f"joint '{name}'", "position", sides)
-        for key in ("velocity", "effort"):
-            if not _number(limit.get(key, "0")) >= 0:
-                raise InputError(
-                    f"joint '{name}' has a limit of {key} of '{limit.get(key):.40}'; expected a number that is not "
-                    f"negative: {REMEDY}"
-                )
-        for tag, stated in (("limit", limit), ("dynamics", dynamics)):
-            for key in NUMBERS[tag]:
-                if np.isnan(_number(text := stated.get(key, "0"))):
-                    raise InputError(f"joint '{name}': the {key} in <{tag}> is '{text:.40}'; expected a number")
+        for tag, keys in NUMBERS.items():
+            for key in keys:
+                text = _attributes(joint, tag).get(key, "0")
+                if not _number(text) >= (-np.inf if key in SIDES else 0.0):
+                    wanted = "a number" if key in SIDES else "zero or more"
+                    raise InputError(
+                        f"joint '{name}': the {key} in <{tag}> is '{text:.40}'; expected {wanted}: {REMEDY}"
+                    )
 
 
 def velocity_limits(root: ET.Element) -> dict[str, float]:
@@ -195,9 +192,10 @@ def velocity_limits(root: ET.Element) -> dict[str, float]:
 
     Joints without one are left out, as are limits of 0, which stand for an unknown limit in some files.
     """
-    stated = {joint.get("name", ""): joint.find("limit") for joint in root.findall("joint")}
-    numbers = {name: _number(limit.get("velocity", "0")) for name, limit in stated.items() if limit is not None}
-    return {name: number for name, number in numbers.items() if number > 0}
+    stated = {
+        joint.get("name", ""): _attributes(joint, "limit").get("velocity", "0") for joint in root.findall("joint")
+    }
+    return {name: _number(text) for name, text in stated.items() if _number(text) > 0}
 
 
 def driven_joints(root: ET.Element) -> list[str]:
@@ -219,6 +217,11 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         return float("nan")
+
+
+def _attributes(element: ET.Element, tag: str) -> dict[str, str]:
+    """Attributes of the first child with this tag; none without it."""
+    return next((part.attrib for part in element.findall(tag)), {})
 
 
 def _with_included(path: Path, root: ET.Element, seen: Collection[Path] = ()) -> Iterator[ET.Element]:

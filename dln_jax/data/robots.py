@@ -28,6 +28,12 @@ from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
 from dln_jax.types import InputError
 
 INSTALL = "pip install 'dln-jax[robot]'"
+Lock = Mapping[str, float] | Sequence[str]
+"""Joints that do not move: names, or positions by name, rad or m."""
+KINDS = ("free", "a ball", "prismatic", "revolute")
+"""MuJoCo's kinds of joints, by their numbers."""
+EQUAL_JOINTS, OVER_JOINT = 2, 1
+"""MuJoCo's numbers of equality constraints between joints, and of joints in fixed tendons."""
 LARGEST_NUMBER = 1e20
 """Largest admissible number, in SI units."""
 
@@ -48,7 +54,7 @@ class Robot(NamedTuple):
     """[d], 1/s or m/s, or one for all; stated in URDF only, since MJCF has no such limit."""
 
 
-def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = ()) -> Robot:
+def read_robot(path: str | Path, *, lock: Lock = ()) -> Robot:
     """Reads a robot from a URDF or MJCF file.
 
     URDF inertias are read as stated, even if they are not physically consistent.
@@ -64,18 +70,19 @@ def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = 
     """
     path, root = Path(path), parse_robot(Path(path))
     try:
-        in_urdf = root.tag == "robot"
-        inertias, speeds = (link_inertias(root), velocity_limits(root)) if in_urdf else (None, {})
-        mujoco, model, locked = compile_robot(path, root, lock)
-        robot = robot_of(mujoco, model, locked, inertias)
-        limits = np.array([speeds.get(name, np.inf) for name in robot.tree.names])
-        return robot._replace(velocity_limits=limits) if in_urdf else robot
+        stated = link_inertias(root) if root.tag == "robot" else None
+        _, model, locked = compile_robot(path, root, lock)
+        robot = robot_of(model, locked, stated)
+        if stated is None:
+            return robot
+        speeds = velocity_limits(root)
+        return robot._replace(velocity_limits=np.array([speeds.get(name, np.inf) for name in robot.tree.names]))
     except InputError as error:
         raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
 
 
 def compile_robot(
-    path: Path, root: ET.Element, lock: Mapping[str, float] | Sequence[str], *, inertias: bool = False
+    path: Path, root: ET.Element, lock: Lock, *, inertias: bool = False
 ) -> tuple[Any, Any, dict[str, float]]:
     """MuJoCo, its model of the file with this root element, and the positions of locked joints by name.
 
@@ -119,7 +126,7 @@ def require_ranges(model: Any, locked: Collection[str] = ()) -> None:
                 require_range(f"joint '{name}'", kind, [f"{limit:.15g}" for limit in limits])
 
 
-def _matching(lock: Mapping[str, float] | Sequence[str], names: Sequence[str]) -> dict[str, float]:
+def _matching(lock: Lock, names: Sequence[str]) -> dict[str, float]:
     """Positions of the locked joints by full name."""
     positions = lock if isinstance(lock, Mapping) else dict.fromkeys(lock, 0.0)
     locked: dict[str, float] = {}
@@ -162,13 +169,12 @@ def quiet(mujoco: Any) -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
 
 
-def _require_tree(mujoco: Any, model: Any, names: list[str], locked: Collection[str]) -> None:
+def _require_tree(model: Any, names: list[str], locked: Collection[str]) -> None:
     """Raises `InputError` unless every joint that is not locked moves freely about or along one axis."""
-    others = {int(mujoco.mjtJoint.mjJNT_BALL): "a ball", int(mujoco.mjtJoint.mjJNT_FREE): "free"}
-    for name, kind in zip(names, map(int, model.jnt_type), strict=True):
-        if kind in others and name not in locked:
+    for name, kind in zip(names, model.jnt_type, strict=True):
+        if KINDS[kind] in ("free", "a ball") and name not in locked:
             raise InputError(
-                f"joint '{name}' is {others[kind]}; expected revolute and prismatic joints: lock it if it does not move"
+                f"joint '{name}' is {KINDS[kind]}; expected revolute and prismatic joints: lock it if it does not move"
             )
     moving = {k for k, name in enumerate(names) if name not in locked}
     for k in moving & set(np.flatnonzero(model.jnt_stiffness)):
@@ -177,10 +183,9 @@ def _require_tree(mujoco: Any, model: Any, names: list[str], locked: Collection[
             "has; remove the stiffness, or lock the joint"
         )
     # Equality constraints and tendons between locked joints have no effect; tendons without a spring are motors.
-    joints, over = int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtWrap.mjWRAP_JOINT)
     springs = np.repeat((model.tendon_stiffness != 0) | np.asarray(model.tendon_limited, bool), model.tendon_num)
     tied = {int(k) for numbers in (model.eq_obj1id, model.eq_obj2id, model.wrap_objid[springs]) for k in numbers}
-    if set(map(int, model.eq_type)) - {joints} or set(map(int, model.wrap_type)) - {over} or tied & moving:
+    if (model.eq_type != EQUAL_JOINTS).any() or (model.wrap_type != OVER_JOINT).any() or tied & moving:
         raise InputError(
             "it has equality constraints or tendons, which close loops; expected a tree: lock the joints that they tie"
         )
@@ -188,16 +193,13 @@ def _require_tree(mujoco: Any, model: Any, names: list[str], locked: Collection[
         raise InputError(f"it has {len(moving)} joints; expected 1 to {MOST_JOINTS} that move")
 
 
-def robot_of(
-    mujoco: Any, model: Any, locked: Mapping[str, float], stated: Mapping[str, np.ndarray] | None = None
-) -> Robot:
+def robot_of(model: Any, locked: Mapping[str, float], stated: Mapping[str, np.ndarray] | None = None) -> Robot:
     """The robot of a compiled model, with the inertias that a URDF states in place of the model's.
 
     Errors as for `read_robot`.
     """
     names = joint_names(model)
-    _require_tree(mujoco, model, names, locked)
-    kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
+    _require_tree(model, names, locked)
     links: list[tuple[int, str, np.ndarray, np.ndarray, np.ndarray]] = []  # parent, kind, rotation, position, axis
     inertias: list[np.ndarray] = []
     moving: list[int] = []
@@ -206,45 +208,54 @@ def robot_of(
     for body in range(1, model.nbody):
         parent, R, p = carried[model.body_parentid[body]]
         p = p + R @ model.body_pos[body]
-        R = R @ _matrix(mujoco, model.body_quat[body])
+        R = R @ _matrix(model.body_quat[body])
         for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
             # The link's frame is at the joint's anchor, the body's frame behind it.
-            anchor, axis, kind = model.jnt_pos[joint], np.array(model.jnt_axis[joint]), int(model.jnt_type[joint])
+            anchor, axis, kind = model.jnt_pos[joint], np.array(model.jnt_axis[joint]), KINDS[model.jnt_type[joint]]
             position = locked.get(names[joint], 0.0) - model.qpos0[model.jnt_qposadr[joint]]
-            R, p = _behind_locked(mujoco, kinds.get(kind), anchor, axis, position, R, p)
+            if kind == "prismatic":
+                p = p + R @ axis * position
+            elif kind == "revolute" and position:
+                turn = _matrix(np.append(np.cos(position / 2), np.sin(position / 2) * axis))
+                p = p + R @ (anchor - turn @ anchor)
+                R = R @ turn
             if names[joint] in locked:
                 continue
             moving.append(joint)
-            links.append((parent, kinds[kind], R, p + R @ anchor, axis))
+            links.append((parent, kind, R, p + R @ anchor, axis))
             inertias.append(np.zeros(10))
             parent = len(links) - 1
             R, p = np.eye(3), -anchor
         carried.append((parent, R, p))
         if stated is None:
-            turn = _matrix(mujoco, model.body_iquat[body])
+            turn = _matrix(model.body_iquat[body])
             about = turn @ np.diag(model.body_inertia[body]) @ turn.T
             theta = np.asarray(inertial_parameters(model.body_mass[body], model.body_ipos[body], about))
         else:
             theta = stated.get(model.body(body).name, np.zeros(10))
-        if parent >= 0 and theta.any():
-            inertias[parent] = inertias[parent] + moved(theta, R, p)
+        if parent >= 0:
+            inertias[parent] += moved(theta, R, p)
     names = tuple(names[joint] for joint in moving)
-    heavy = [theta[0] > 0 for theta in inertias]
-    parents, joints, rotations, positions, axes = zip(*links, strict=True)
+    masses = [theta[0] for theta in inertias]
     for link in reversed(range(len(links))):  # parents come before their children
-        if heavy[link] and parents[link] >= 0:
-            heavy[parents[link]] = True
-    if not all(heavy):
-        name = names[heavy.index(False)]
+        if (parent := links[link][0]) >= 0:
+            masses[parent] += masses[link]
+    if not all(masses):
+        name = names[masses.index(0)]
         raise InputError(f"joint '{name}' moves no mass; expected an <inertial> for the link behind it")
-    dofs, infinite = model.jnt_dofadr[moving], np.array([-np.inf, np.inf])
+    gravity = np.asarray(model.opt.gravity)
     tree = make_tree(
-        parents, joints, rotations, positions, axes, inertias,
-        armature=_armature(model, moving), gravity=np.asarray(model.opt.gravity), names=names,
-    )  # fmt: skip
-    ranges = np.where(np.asarray(model.jnt_limited, bool)[moving, None], model.jnt_range[moving], infinite)
-    forces = np.where(np.asarray(model.jnt_actfrclimited, bool)[moving, None], model.jnt_actfrcrange[moving], infinite)
-    robot = Robot(tree, model.dof_damping[dofs], model.dof_frictionloss[dofs], ranges, forces)
+        *zip(*links, strict=True), inertias=inertias, armature=_armature(model, moving), gravity=gravity, names=names
+    )
+    positions, forces = (
+        np.where(np.asarray(limited, bool)[moving, None], limits[moving], [-np.inf, np.inf])
+        for limited, limits in (
+            (model.jnt_limited, model.jnt_range),
+            (model.jnt_actfrclimited, model.jnt_actfrcrange),
+        )
+    )
+    dofs = model.jnt_dofadr[moving]
+    robot = Robot(tree, model.dof_damping[dofs], model.dof_frictionloss[dofs], positions, forces)
     _require_numbers(robot)
     return robot
 
@@ -265,33 +276,20 @@ def _armature(model: Any, moving: list[int]) -> np.ndarray:
 def _require_numbers(robot: Robot) -> None:
     """Raises `InputError` for numbers out of the range of real robots."""
     tree = robot.tree
-    frames = {"inertia": tree.inertias, "position": tree.positions, "rotation": tree.rotations, "axis": tree.axes}
     armature = tree.armature if np.ndim(tree.armature) == 1 else np.diagonal(tree.armature)
     losses = {"damping": robot.damping, "dry friction": robot.coulomb, "armature": armature}
-    for what, stated in {**frames, "gravity": [tree.gravity] * tree.degrees_of_freedom, **losses}.items():
-        numbers = np.asarray(stated, float).reshape(tree.degrees_of_freedom, -1)
-        right = (np.abs(numbers) <= LARGEST_NUMBER) & ((numbers >= 0) | (what not in losses))
-        for joint in np.flatnonzero(~right.all(axis=1))[:1]:
-            wanted = "zero or more" if what in losses else f"numbers up to {LARGEST_NUMBER:.0e}"
-            shown = ", ".join(f"{number:.3g}" for number in numbers[joint])
-            raise InputError(f"the {what} of joint '{tree.names[joint]}' is {shown}; expected {wanted}")
+    frames = {"inertia": tree.inertias, "position": tree.positions, "rotation": tree.rotations, "axis": tree.axes}
+    for joint, name in enumerate(tree.names):
+        for what, stated in {**frames, "gravity": [tree.gravity] * len(tree.names), **losses}.items():
+            numbers = np.ravel(stated[joint])
+            least = 0.0 if what in losses else -LARGEST_NUMBER
+            if not ((numbers >= least) & (numbers <= LARGEST_NUMBER)).all():
+                wanted = "zero or more" if what in losses else f"numbers up to {LARGEST_NUMBER:.0e}"
+                shown = ", ".join(f"{number:.3g}" for number in numbers)
+                raise InputError(f"the {what} of joint '{name}' is {shown}; expected {wanted}")
 
 
-def _behind_locked(
-    mujoco: Any, kind: str | None, anchor: np.ndarray, axis: np.ndarray, position: float, R: np.ndarray, p: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Frame of the body behind a locked joint, relative to the link it moves with."""
-    if kind == "prismatic":
-        return R, p + R @ axis * position
-    if kind is None or position == 0:
-        return R, p
-    quaternion = np.zeros(4)
-    mujoco.mju_axisAngle2Quat(quaternion, axis, position)
-    turn = _matrix(mujoco, quaternion)
-    return R @ turn, p + R @ (anchor - turn @ anchor)
-
-
-def _matrix(mujoco: Any, quaternion: np.ndarray) -> np.ndarray:
+def _matrix(quaternion: np.ndarray) -> np.ndarray:
     matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, quaternion)
+    importlib.import_module("mujoco").mju_quat2Mat(matrix, quaternion)
     return np.where(np.abs(matrix) < 1e-15, 0.0, matrix).reshape(3, 3)

@@ -88,6 +88,17 @@ def test_a_file_keeps_what_is_not_identified(tmp_path):
     assert_allclose(float(masses["two"].get("value")), 0.75)
 
 
+def test_coupled_motors_of_joints_without_names_are_read_again(tmp_path):
+    original, path = tmp_path / "arm.xml", tmp_path / "new.xml"
+    original.write_text(MJCF)
+    tree = read_robot(original).tree
+    armature = np.eye(len(tree.joints)) + 0.1
+    write_robot(path, original, tree._replace(armature=armature))
+    again = read_robot(path).tree
+    assert again.names == tree.names
+    assert_allclose(again.armature, armature)
+
+
 def test_a_robot_survives_as_mjcf(tmp_path):
     original, path = tmp_path / "arm.urdf", tmp_path / "arm.xml"
     original.write_text(URDF)

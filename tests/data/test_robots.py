@@ -193,7 +193,7 @@ REFUSED = (
     (urdf(ONE, SHOULDER.replace("revolute", "fixed")), "it has 0 joints"),
     (ARM.replace('type="continuous"', 'type="planar"'), "of type 'planar'"),
     (ARM.replace('type="continuous"', ""), "of type 'None'"),
-    (ARM.replace('joint name="elbow"', 'joint name="shoulder"'), "two joints are named"),
+    (ARM.replace('joint name="elbow"', 'joint name="shoulder"'), "names 'shoulder' twice; expected once"),
     (
         HINGE.replace('name="elbow" axis="0 1 0" {}', 'name="hip" type="ball"'),
         "joint 'hip' is a ball",
@@ -202,8 +202,8 @@ REFUSED = (
     (HINGE.format('stiffness="2"'), r"joint 'elbow' has a spring \(stiffness 2\)"),
     (limited('damping="0.2"', 'damping="nan"'), "damping in <dynamics> is 'nan'"),
     (limited('damping="0.2"', 'damping="-1"'), "zero or more"),
-    (limited('velocity="3"', 'velocity="fast"'), "limit of velocity of 'fast'; expected a number"),
-    (limited('effort="30"', 'effort="nan"'), "limit of effort of 'nan'"),
+    (limited('velocity="3"', 'velocity="fast"'), "velocity in <limit> is 'fast'; expected zero or more"),
+    (limited('effort="30"', 'effort="nan"'), "effort in <limit> is 'nan'"),
     # MuJoCo would read each of these as a joint without limits.
     (limited('lower="-1"', ""), RANGE),
     *((limited('lower="-1"', f'lower="{lower}"'), RANGE) for lower in ("nan", "-inf", "ten", "2", "3")),

@@ -109,7 +109,7 @@ def _described(
         which = f"2 to {MOST_JOINTS}, one of them passive" if passive else f"1 to {MOST_JOINTS}"
         raise InputError(f"the plant has {len(names)} joint(s); expected {which}")
     per_second, steps = sampling(model, rate)
-    robot = robot_of(mujoco, model, {})
+    robot = robot_of(model, {})
     _require_known_forces(mujoco, model)
     joints, ranges = robot.tree.joints, robot.position_limits
     controls, largest = _motors(mujoco, model, robot)

@@ -9,6 +9,7 @@ If these steps are whole multiples of one period and the stamps are not, rows ar
 robot hardly moves, they are interpolated. All times are late by the mean lateness of the stamps.
 """
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,9 @@ NEAR = 100
 """Number of rows on either side of a gap between counted steps whose lateness is compared."""
 LATE = 0.1
 """s: largest correction of a stamp."""
+
+Counts = tuple[np.ndarray, np.ndarray]
+"""Indices of rows, and the whole number of periods from the first of them to each."""
 
 
 class Clock(NamedTuple):
@@ -63,81 +67,77 @@ def source_clock(data: Trajectories, interpolated: Bool[np.ndarray, " N"] | None
     if "qd" in data.estimated or len(known) <= LEAST:
         return None
     t, trajectory = data.t[known], data.trajectory[known]
-    counted = _counted(t, data.q[known], data.qd[known], np.diff(trajectory) == 0)
-    if counted is None:
+    if (periods := _count_periods(t, data.q[known], data.qd[known], np.diff(trajectory) == 0)) is None:
         return None
-    whole, jitter = counted
+    whole, jitter = periods
     runs = np.flatnonzero(np.diff(np.r_[0, (whole > 0).astype(int), 0])).reshape(-1, 2)
-    counts = [np.r_[0.0, np.cumsum(whole[first:last])] for first, last in runs]
-    period = _common_slope(counts, [t[first : last + 1] for first, last in runs])
-    rows, grids = [], []
-    for index in np.unique(trajectory[runs[:, 0]]):
-        own = [k for k, (first, _) in enumerate(runs) if trajectory[first] == index]
-        rows.append(np.concatenate([np.arange(runs[k, 0], runs[k, 1] + 1) for k in own]))
-        grids.append(_on_one_grid([t[runs[k, 0] : runs[k, 1] + 1] for k in own], [counts[k] for k in own], period))
-    period = _common_slope(grids, [t[own] for own in rows])
+    parts = [(np.arange(first, last + 1), np.r_[0.0, np.cumsum(whole[first:last])]) for first, last in runs]
+    joined = _on_one_grid(t, trajectory, parts, _common_slope(t, parts))
+    period = _common_slope(t, joined.values())
     corrected = data.t.copy()
-    for own, grid in zip(rows, grids, strict=True):
-        times = t[own].mean() + period * (grid - grid.mean())
-        every = np.flatnonzero(data.trajectory == trajectory[own[0]])
-        corrected[every] = _between(every, known[own], times, data.t[every])
+    for index, (rows, grid) in joined.items():
+        times = t[rows].mean() + period * (grid - grid.mean())
+        measured = known[rows]
+        own = np.flatnonzero(data.trajectory == index)
+        stamps = data.t[own]
+        # Equal steps between counted rows; stamps, shifted, before the first and after the last.
+        even = np.interp(own, measured, times)
+        inside = np.clip(stamps, *data.t[measured[[0, -1]]])
+        corrected[own] = np.where(stamps == inside, even, stamps + even - inside)
     return Clock(corrected, period, jitter) if np.abs(corrected - data.t).max() <= LATE else None
 
 
-def _counted(t: np.ndarray, q: np.ndarray, qd: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, float] | None:
+def _count_periods(t: np.ndarray, q: np.ndarray, qd: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, float] | None:
     """Returns the periods of each step, 0 where they cannot be counted, and the jitter of the stamps in periods.
 
     `inside` marks the steps [N - 1] within a trajectory. `None` if the steps are not whole numbers of periods, or not
     clearly more regular than the stamps.
     """
     size = np.mean(qd**2, axis=0)
-    weights = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
+    weights = 1 / np.where(size > 0, size, np.inf)
     v = (qd[1:] + qd[:-1]) / 2
     speed = v**2 @ weights
     moving = inside & (speed > MOVING**2 * np.sum(weights > 0))
     if moving.sum() < LEAST:
         return None
-    stamped, steps = np.diff(t), (np.diff(q, axis=0) * v) @ weights / np.where(speed > 0, speed, 1.0)
-    period = float(np.median(steps[moving]))
+    stamped = np.diff(t)[moving]
+    steps = ((np.diff(q, axis=0) * v) @ weights)[moving] / speed[moving]
+    period = float(np.median(steps))
     if not period > 0:
         return None
     whole = np.round(steps / period)
-    period = float(steps[moving].sum() / max(whole[moving].sum(), 1.0))
-    off, off_stamps = (np.abs(of / period - whole)[moving] for of in (steps, stamped))
-    regular = np.mean((off <= REGULAR) & (whole[moving] >= 1)) >= SHARE
-    same = abs(period * whole[moving].sum() / stamped[moving].sum() - 1) <= SAME
+    period = float(steps.sum() / max(whole.sum(), 1.0))
+    off, off_stamps = (np.abs(of / period - whole) for of in (steps, stamped))
+    regular = np.mean((off <= REGULAR) & (whole >= 1)) >= SHARE
+    same = abs(period * whole.sum() / stamped.sum() - 1) <= SAME
     jitter = float(np.sqrt(np.mean(off_stamps**2)))
     if not (regular and same and jitter >= JITTER and np.median(off) <= BETTER * np.median(off_stamps)):
         return None
-    return np.where(moving, np.maximum(whole, 0.0), 0.0), jitter
+    counts = np.zeros(len(moving))
+    counts[moving] = np.maximum(whole, 0.0)
+    return counts, jitter
 
 
-def _common_slope(counts: list[np.ndarray], stamps: list[np.ndarray]) -> float:
+def _common_slope(t: np.ndarray, parts: Iterable[Counts]) -> float:
     """Returns the period on the clock of the stamps: their common slope over the counts, by least squares."""
-    centred = [(count - count.mean(), t - t.mean()) for count, t in zip(counts, stamps, strict=True)]
-    return float(sum(count @ t for count, t in centred) / sum(count @ count for count, _ in centred))
+    centred = [(counts - counts.mean(), t[rows] - t[rows].mean()) for rows, counts in parts]
+    return float(sum(counts @ stamps for counts, stamps in centred) / sum(counts @ counts for counts, _ in centred))
 
 
-def _on_one_grid(stamps: list[np.ndarray], counts: list[np.ndarray], period: float) -> np.ndarray:
-    """Returns the counts of all runs of one trajectory from one start, so that they are late as their stamps are.
+def _on_one_grid(t: np.ndarray, trajectory: np.ndarray, parts: list[Counts], period: float) -> dict[int, Counts]:
+    """Returns one part per trajectory, with counts from one start, so that they are late as their stamps are.
 
     A run begins so many whole periods after the rows before it that the lateness of neighbouring rows agrees in the
     mean; over many rows the period is not yet accurate enough.
     """
-    grid, before = counts[0], stamps[0]
-    for count, t in zip(counts[1:], stamps[1:], strict=True):
-        late = np.mean(before[-NEAR:] / period - grid[-NEAR:])
-        shift = np.round(np.mean(t[:NEAR] / period - count[:NEAR]) - late)
-        grid = np.concatenate([grid, max(shift, grid[-1] + 1) + count])
-        before = np.concatenate([before, t])
-    return grid
-
-
-def _between(rows: np.ndarray, known: np.ndarray, times: np.ndarray, stamps: np.ndarray) -> np.ndarray:
-    """Returns the times of rows: the known ones, equal steps between them, and stamps, shifted, before and after."""
-    result = np.interp(rows, known, times)
-    before, after = rows < known[0], rows > known[-1]
-    at = np.searchsorted(rows, known[[0, -1]])
-    result[before] = stamps[before] + times[0] - stamps[at[0]]
-    result[after] = stamps[after] + times[-1] - stamps[at[1]]
-    return result
+    joined: dict[int, Counts] = {}
+    for rows, counts in parts:
+        index = int(trajectory[rows[0]])
+        if index in joined:
+            before, grid = joined[index]
+            late = np.mean(t[before[-NEAR:]] / period - grid[-NEAR:])
+            shift = np.round(np.mean(t[rows[:NEAR]] / period - counts[:NEAR]) - late)
+            counts = np.append(grid, max(shift, grid[-1] + 1) + counts)
+            rows = np.append(before, rows)
+        joined[index] = rows, counts
+    return joined

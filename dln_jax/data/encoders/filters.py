@@ -36,7 +36,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from dln_jax.data.encoders.sampling import NORMAL, by_trajectory
+from dln_jax.data.encoders.sampling import NORMAL, by_trajectory, spline
 from dln_jax.types import InputError, require_positive
 
 ORDER = 4
@@ -60,6 +60,8 @@ JUMP = 8.0
 """A jump differs from its neighbours' prediction by more than this many standard deviations."""
 RARE = 0.1
 """Largest fraction of samples that can be jumps; more of them are a motion, or noise that is not white."""
+DEVIATION = np.array([-1, 6, -15, 20, -15, 6, -1]) / 20
+"""Weights of seven samples for the deviation of the middle one from the quintic through the others."""
 PREDICTION = math.sqrt(1 + 524 / 400)
 """Standard deviation of the prediction error, in units of the noise."""
 MEDIAN = math.log(2)
@@ -96,20 +98,13 @@ def gain(f: Float[np.ndarray, " n"], cutoff: float) -> Float[np.ndarray, " n"]:
     return 1 / (1 + (f / cutoff) ** (2 * ORDER))
 
 
-def low_pass(
-    values: Float[np.ndarray, "N k"],
-    *,
-    rate: float,
-    cutoff: float,
-    trajectory: Int[np.ndarray, " N"] | None = None,
-) -> Float[np.ndarray, "N k"]:
-    """Low-pass filters values at equal steps, every trajectory separately.
+def low_pass(values: Float[np.ndarray, "N k"], *, rate: float, cutoff: float) -> Float[np.ndarray, "N k"]:
+    """Low-pass filters values of one trajectory at equal steps.
 
     Args:
         values: columns of any quantity linear in the unknowns: torques, or columns of a regressor.
         rate: sampling rate, Hz.
         cutoff: Hz; infinite returns the values unchanged.
-        trajectory: trajectory of every sample (default: one).
 
     Raises:
         InputError: the cut-off is not below half the rate.
@@ -121,14 +116,9 @@ def low_pass(
         raise InputError(f"cutoff is {cutoff:g} Hz; expected less than {rate / 2:g} Hz, half the rate of the samples")
     from scipy.signal import butter, sosfiltfilt
 
-    sections = butter(ORDER, cutoff, fs=rate, output="sos")
-    extension = int(np.ceil(PERIODS * rate / cutoff))
-    filtered = []
-    for part in [values] if trajectory is None else by_trajectory(values, trajectory):
-        slow = _between_ends(part, int(np.ceil(END_PERIODS * rate / cutoff)))
-        rest = sosfiltfilt(sections, part - slow, axis=0, padlen=min(extension, len(part) - 1))
-        filtered.append(slow + rest)
-    return np.concatenate(filtered)
+    slow = _between_ends(values, int(np.ceil(END_PERIODS * rate / cutoff)))
+    extension = min(int(np.ceil(PERIODS * rate / cutoff)), len(values) - 1)
+    return slow + sosfiltfilt(butter(ORDER, cutoff, fs=rate, output="sos"), values - slow, axis=0, padlen=extension)
 
 
 def _between_ends(values: np.ndarray, near: int) -> np.ndarray:
@@ -159,11 +149,9 @@ def derivatives(
     require_positive(rate=rate)
     if len(q) < 6:
         raise InputError(f"a segment has {len(q)} samples; its rates take at least 6: record longer motions")
-    from scipy.interpolate import make_interp_spline
-
     t = np.arange(len(q)) / rate
-    spline = make_interp_spline(t, q, k=5, axis=0)
-    return spline(t, nu=1), spline(t, nu=2)
+    curve = spline(t, q, 5)
+    return curve(t, nu=1), curve(t, nu=2)
 
 
 def choose_cutoff(
@@ -193,50 +181,43 @@ def choose_cutoff(
     moves = (sizes > 0) & (q.std(axis=0) > MOVES * noise)
     if not moves.any():
         raise InputError("no joint moves by more than its noise, so no cut-off can be chosen; give one, or check q")
-    error = np.empty(CANDIDATES)
-    for place, cutoff in enumerate(tried):
-        H = gain(f, float(cutoff))[:, None]
+    errors = []
+    for cutoff in (*tried, np.inf):
+        H = gain(f, cutoff)[:, None]
         left = weight @ ((1 - H) ** 2 * signal + H**2 * floor)
-        error[place] = np.mean(left[moves] / sizes[moves])
-    best = int(np.argmin(error))
-    raw = np.mean((weight @ floor)[moves] / sizes[moves])
-    cutoff = float(tried[best]) if raw > WORTH**2 else np.inf
-    return Choice(cutoff, tried, error, f, spectrum, white)
+        errors.append(np.mean(left[moves] / sizes[moves]))
+    *error, raw = errors
+    cutoff = float(tried[np.argmin(error)]) if raw > WORTH**2 else np.inf
+    return Choice(cutoff, tried, np.array(error), f, spectrum, white)
 
 
 def _without_jumps(values: np.ndarray, trajectory: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Interpolates rare samples of channels [N, k] that neither noise [k] nor the motion explains.
 
-    A sample is compared with the prediction of the quintic through three samples on either side, (1, -6, 15, 15, -6, 1)
-    / 20. It is a jump if the error is many standard deviations both of the noise and of such errors elsewhere.
+    A sample is compared with the prediction of the quintic through three samples on either side. It is a jump if the
+    error is many standard deviations both of the noise and of such errors elsewhere.
     """
-    from scipy.interpolate import make_interp_spline
-    from scipy.ndimage import maximum_filter1d
+    from scipy.ndimage import correlate1d, maximum_filter1d
 
-    inside = np.flatnonzero(trajectory[6:] == trajectory[:-6]) + 3
-    if not len(inside):
+    inside = np.pad(trajectory[6:] == trajectory[:-6], 3)
+    if not inside.any():
         return values
-    sums = [values[inside - k] + values[inside + k] for k in (1, 2, 3)]
-    errors = np.zeros_like(values)
-    errors[inside] = np.abs(values[inside] - (15 * sums[0] - 6 * sums[1] + sums[2]) / 20)
+    errors = np.abs(correlate1d(values, DEVIATION, axis=0)) * inside[:, None]
     usual = np.maximum(PREDICTION * noise, np.median(errors[inside], axis=0) / NORMAL)
     # A jump also causes errors in neighbouring samples; only the largest error nearby counts.
     wrong = (errors > JUMP * usual) & (errors == maximum_filter1d(errors, 7, axis=0))
     values, places = values.copy(), np.arange(len(values))
     for channel in np.flatnonzero(wrong.any(axis=0) & (wrong.mean(axis=0) < RARE)):
         bad = wrong[:, channel]
-        values[bad, channel] = make_interp_spline(places[~bad], values[~bad, channel], k=5)(places[bad])
+        values[bad, channel] = spline(places[~bad], values[~bad, channel], 5)(places[bad])
     return values
 
 
 def _flat_top(f: np.ndarray, spectrum: np.ndarray) -> np.ndarray:
     """Level [d] of the upper half of a spectrum [F, d] that is flat, as white noise is; zero otherwise."""
-    parts = [np.median(part, axis=0) for part in np.array_split(spectrum[f > f[-1] / 2], 3) if len(part)]
-    if len(parts) < 3:
-        return np.zeros(spectrum.shape[1])
-    levels = np.array(parts)
-    flat = levels.max(axis=0) < FLAT * levels.min(axis=0)
-    return np.where(flat, levels.min(axis=0) / MEDIAN, 0.0)
+    levels = [np.median(part, axis=0) for part in np.array_split(spectrum[f > f[-1] / 2], 3)]
+    lowest = np.min(levels, axis=0)
+    return np.where(np.max(levels, axis=0) < FLAT * lowest, lowest / MEDIAN, 0.0)
 
 
 def _rising(f: np.ndarray, spectrum: np.ndarray, white: np.ndarray) -> np.ndarray:
@@ -252,7 +233,7 @@ def _rising(f: np.ndarray, spectrum: np.ndarray, white: np.ndarray) -> np.ndarra
     envelopes = _highest(f[:, None] ** 4 * _mean(spectrum), math.sqrt(1 / GAP), math.sqrt(GAP))
     rising = np.zeros_like(spectrum)
     for channel, (power, envelope) in enumerate(zip(accelerations.T, envelopes.T, strict=True)):
-        peak = int(np.argmax(power[f < f[-1] / 4])) if (f < f[-1] / 4).any() else 0
+        peak = int(np.argmax(power[f < f[-1] / 4]))
         lowest, of_envelope = (peak + int(np.argmin(values[peak:])) for values in (power, envelope))
         if math.sqrt(GAP) * f[lowest] < f[of_envelope]:  # a gap
             lowest = of_envelope
@@ -265,7 +246,7 @@ def _rising(f: np.ndarray, spectrum: np.ndarray, white: np.ndarray) -> np.ndarra
 
 
 def _spectra(values: np.ndarray, trajectory: np.ndarray, *, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Positive frequencies [F], Hz, and power spectra [F, k] of channels [N, k], unit² / Hz, averaged over segments.
+    """Positive frequencies [F], Hz, F >= 7, and power spectra [F, k] of channels [N, k], unit² / Hz, over segments.
 
     Raises:
         InputError: no trajectory has sixteen samples.
@@ -276,21 +257,19 @@ def _spectra(values: np.ndarray, trajectory: np.ndarray, *, rate: float) -> tupl
     if not parts:
         raise InputError("no segment has the 16 samples of a spectrum; record longer motions, or give a cut-off")
     length = min(max(len(part) for part in parts) - 2, max(14, round(SEGMENT * rate)))
-    total, weight = 0.0, 0
-    f = np.zeros(0)
+    f, powers = np.zeros(0), []
     for part in parts:
         changes = np.diff(part, n=2, axis=0)
-        if len(changes) < length:
-            changes = np.concatenate([changes, np.zeros((length - len(changes), changes.shape[1]))])
-        f, power = welch(changes, fs=rate, nperseg=length, axis=0)
-        total, weight = total + len(part) * power * (length / min(length, len(part) - 2)), weight + len(part)
-    power = np.asarray(total)[1:] / weight
+        padded = np.pad(changes, ((0, max(length - len(changes), 0)), (0, 0)))
+        f, power = welch(padded, fs=rate, nperseg=length, axis=0)
+        powers.append(len(part) * power[1:] * (length / min(length, len(changes))))  # zeros have no power
+    power = sum(powers) / sum(map(len, parts))
     return f[1:], power / (2 * np.sin(np.pi * f[1:, None] / rate)) ** 4
 
 
 def _mean(spectrum: np.ndarray) -> np.ndarray:
     """Mean of a spectrum [F, d] over a sixth of an octave on either side, which keeps lines."""
-    summed = np.concatenate([np.zeros((1, spectrum.shape[1])), np.cumsum(spectrum, axis=0)])
+    summed = np.pad(np.cumsum(spectrum, axis=0), ((1, 0), (0, 0)))
     low, high = _window(len(spectrum), 2 ** (-1 / 6), 2 ** (1 / 6))
     return (summed[high] - summed[low]) / (high - low)[:, None]
 

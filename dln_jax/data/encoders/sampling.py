@@ -12,7 +12,7 @@ the usual distance, because the source is slower than the log's times claim.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -25,6 +25,8 @@ BRIDGED = 3.5
 """Gaps up to this multiple of the median step are interpolated; longer ones cut a trajectory."""
 EVEN = 1e-3
 """Samples are not resampled up to this relative deviation from equal steps."""
+DROPPED = ("p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
+"""Arrays of a log that are dropped when it is brought to equal steps."""
 ORDERS = (2, 3, 4, 5, 6)
 NORMAL = 0.67448975
 """Median absolute value of a standard normal variable."""
@@ -112,9 +114,14 @@ def even(
     uniform = t[0] + np.arange(count) / rate
     if count == len(t) and np.abs(t - uniform).max() * rate < EVEN:
         return uniform, values
+    return uniform, spline(t, values)(np.minimum(uniform, t[-1]))
+
+
+def spline(t: Float[np.ndarray, " n"], values: np.ndarray, degree: int = 3) -> Any:
+    """SciPy's spline through values [n, ..], of a lower degree if there are too few."""
     from scipy.interpolate import make_interp_spline
 
-    return uniform, make_interp_spline(t, values, k=min(3, len(t) - 1), axis=0)(np.minimum(uniform, t[-1]))
+    return make_interp_spline(t, values, k=min(degree, len(t) - 1))
 
 
 def held_at_equal_steps(data: Trajectories, rate: float | None = None) -> Trajectories:
@@ -127,26 +134,24 @@ def held_at_equal_steps(data: Trajectories, rate: float | None = None) -> Trajec
         data: q, tau and the times of the samples.
         rate: rate of the equal steps, Hz (default: the median of the data).
     """
+    from scipy.interpolate import BSpline
+
     rate = typical_rate(data) if rate is None else rate
-    columns: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "q", "tau", "trajectory")}
+    step = 1 / rate
+    rows = []
     for piece in segments(data.t, data.trajectory, gap=BRIDGED):
         t, q, tau = data.t[piece], data.q[piece], data.tau[piece]
         times, positions = even(t, q, rate)
-        rows = times, positions, tau if positions is q else _mean_of_held(t, tau, times, 1 / rate)
-        for key, part in zip(columns, (*rows, np.full(len(times), data.trajectory[piece[0]])), strict=True):
-            columns[key].append(part)
-    joined = {key: np.concatenate(parts) for key, parts in columns.items()}
-    absent = np.full_like(joined["q"], np.nan)
-    others = dict.fromkeys(("p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity", "temperature"))
-    return data._replace(**joined, qd=absent, qdd=absent, **others)
-
-
-def _mean_of_held(t: np.ndarray, values: np.ndarray, times: np.ndarray, step: float) -> np.ndarray:
-    """Returns the mean over the step from each of `times` on; values are held to the next sample, the last for ever."""
-    ends = np.append(t, max(t[-1], times[-1]) + 2 * step)
-    integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(np.diff(ends)[:, None] * values, axis=0)])
-    at = [[np.interp(moments, ends, column) for column in integral.T] for moments in (times, times + step)]
-    return (np.array(at[1]) - np.array(at[0])).T / step
+        if positions is not q:
+            # Values are held to the next sample, the last for ever.
+            ends = np.append(t, max(t[-1], times[-1]) + 2 * step)
+            integral = BSpline(ends, tau, 0).antiderivative()
+            tau = (integral(times + step) - integral(times)) / step
+        rows.append((times, positions, tau, np.full(len(times), data.trajectory[piece[0]])))
+    t, q, tau, trajectory = map(np.concatenate, zip(*rows, strict=True))
+    absent = np.full_like(q, np.nan)
+    dropped = dict.fromkeys((*DROPPED, "temperature"))
+    return data._replace(t=t, q=q, qd=absent, qdd=absent, tau=tau, trajectory=trajectory, **dropped)
 
 
 def noise_of(values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"]) -> Float[np.ndarray, " k"]:
@@ -158,11 +163,12 @@ def noise_of(values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"]
     parts = [part for part in by_trajectory(values, trajectory) if len(part) > max(ORDERS)]
     if not parts:
         return np.full(values.shape[1], np.inf)
-    of_orders = []
+    smallest = step_of(values) / math.sqrt(12)
+    spreads = []
     for order in ORDERS:
-        changes = np.abs(np.concatenate([np.diff(part, n=order, axis=0) for part in parts]))
-        of_orders.append(np.median(changes, axis=0) / (NORMAL * math.sqrt(math.comb(2 * order, order))))
-    return np.maximum(np.min(of_orders, axis=0), step_of(values) / math.sqrt(12))
+        changes = np.concatenate([np.diff(part, n=order, axis=0) for part in parts])
+        spreads.append(np.median(abs(changes), axis=0) / (NORMAL * math.sqrt(math.comb(2 * order, order))))
+    return np.maximum(np.min(spreads, axis=0), smallest)
 
 
 def torque_noise(data: Trajectories) -> Float[np.ndarray, " d"] | None:
@@ -217,23 +223,19 @@ def delay_held(values: Float[np.ndarray, "N k"], samples: float) -> Float[np.nda
         raise InputError(f"delay is {samples}; expected a number of samples, 0 or more")
     whole = int(samples)
     share = samples - whole
-    held = np.concatenate([np.zeros((whole + 1, values.shape[1])), values])[: len(values) + 1]
+    held = np.pad(values, ((whole + 1, 0), (0, 0)))[: len(values) + 1]
     return (1 - share) * held[1:] + share * held[:-1]
 
 
 def find_repeats(
     q: Float[np.ndarray, "N d"], tau: Float[np.ndarray, "N d"], trajectory: Int[np.ndarray, " N"]
 ) -> Repeats:
-    """Finds repeated samples of q and of tau; torques that never vary count as repeating with q."""
+    """Finds repeated samples of q and of tau; torques that never vary repeat with q."""
     of_q, after = _repeating(q, trajectory)
-    if not np.ptp(tau, axis=0).any():
-        return Repeats(of_q, of_q, after < LOST)
     of_tau, _ = _repeating(tau, trajectory)
     # A torque may be constant by itself, so a repeated row requires repeated coordinates.
-    same = np.r_[False, (np.diff(tau, axis=0) == 0).all(axis=1)]
-    of_tau = of_tau | (of_q & same)
-    both = of_q & of_tau
-    return Repeats(of_q, of_tau, bool(both.any() and np.array_equal(of_q, both)) and after < LOST)
+    of_tau |= of_q & np.r_[False, (np.diff(tau, axis=0) == 0).all(axis=1)]
+    return Repeats(of_q, of_tau, after < LOST and not (of_q & ~of_tau).any())
 
 
 def without_repeats(data: Trajectories) -> tuple[Trajectories, Repeats]:
@@ -243,7 +245,7 @@ def without_repeats(data: Trajectories) -> tuple[Trajectories, Repeats]:
     the same total. If q or tau repeat alone, they are interpolated.
     """
     repeats = find_repeats(data.q, data.tau, data.trajectory)
-    if not (repeats.q.any() or repeats.tau.any()):
+    if not (repeats.q | repeats.tau).any():
         return data, repeats
     t, trajectory = data.t, data.trajectory
     q = interpolate(t, data.q, trajectory, repeats.q & ~repeats.rows)
@@ -254,7 +256,10 @@ def without_repeats(data: Trajectories) -> tuple[Trajectories, Repeats]:
 
 
 def _repeating(values: np.ndarray, trajectory: np.ndarray) -> tuple[np.ndarray, float]:
-    """Mask of the rows that repeat the one before, and the size of the step after a repeat in usual steps."""
+    """Mask of the rows that repeat the one before, and the size of the step after a repeat in usual steps.
+
+    The size is infinite without repeats.
+    """
     repeating = np.zeros(len(values), bool)
     changes = np.diff(values, axis=0)
     inside = np.diff(trajectory) == 0
@@ -269,13 +274,13 @@ def _repeating(values: np.ndarray, trajectory: np.ndarray) -> tuple[np.ndarray, 
     along, usual_squared = 0.0, 0.0
     for first, last in np.flatnonzero(np.diff(np.r_[0, same.astype(int), 0])).reshape(-1, 2):
         # Samples first + 1 to last repeat sample first; the changes before and after may end other repeats.
-        place = int(np.searchsorted(moves, first))
-        if not 0 < place < len(moves) - 1 or last - first > LONGEST:
+        later = np.searchsorted(moves, last + 1)
+        if first == 0 or later == len(moves) or last - first > LONGEST:
             continue
-        before, after = moves[place - 1], moves[place + 1]
-        if after - before > 3 * LONGEST or not inside[before : after + 1].all():
+        after = moves[later]
+        if after - first >= 3 * LONGEST or not inside[first - 1 : after + 1].all():
             continue
-        usual, ending, following = changes[before], changes[last], changes[after]
+        usual, ending, following = changes[first - 1], changes[last], changes[after]
         smaller = np.minimum(usual * np.sign(ending), following * np.sign(ending))
         moving = (np.abs(ending) > CLEAR * levels) & (smaller > COMPARABLE * np.abs(ending) / (last - first + 1))
         # Noise without levels never repeats exactly.
@@ -293,13 +298,11 @@ def interpolate(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, wrong
     """Replaces the wrong samples by a cubic spline through the others of their trajectory."""
     if not wrong.any():
         return values
-    from scipy.interpolate import make_interp_spline
-
     values = values.copy()
     for index in np.unique(trajectory[wrong]):
         here = np.flatnonzero(trajectory == index)
         good, bad = here[~wrong[here]], here[wrong[here]]
-        values[bad] = make_interp_spline(t[good], values[good], k=min(3, len(good) - 1), axis=0)(t[bad])
+        values[bad] = spline(t[good], values[good])(t[bad])
     return values
 
 

@@ -107,7 +107,7 @@ def smooth(
     if trim is not None and not trim >= 0:
         raise InputError(f"trim is {trim}; expected seconds >= 0")
     data, repeats = without_repeats(data)
-    of_q = (repeats.q & ~repeats.rows)[~repeats.rows]
+    of_q = repeats.q[~repeats.rows]
     clock = source_clock(data, of_q)
     if clock is not None:
         data = data._replace(t=clock.t, q=interpolate(clock.t, data.q, data.trajectory, of_q))
@@ -137,7 +137,7 @@ def smooth(
             f"no segment without a gap has {shortest} samples, four periods of the cut-off at {rate:g} Hz; record "
             "longer motions, or give a higher cut-off"
         )
-    columns: dict[str, list[np.ndarray]] = {}
+    parts: list[dict[str, np.ndarray]] = []
     for piece, t, x in long:
         q = low_pass(x[:, :d], rate=rate, cutoff=cutoff)
         qd, qdd = derivatives(q, rate=rate)
@@ -145,22 +145,31 @@ def smooth(
         arrays = {"t": t, "q": q, "qd": qd, "qdd": qdd, "tau": tau}
         if data.temperature is not None:
             slow = [np.interp(t, data.t[piece], column) for column in data.temperature[piece].T]
-            arrays["temperature"] = np.stack(slow, axis=1)
-        for key, array in arrays.items():
-            columns.setdefault(key, []).append(array[ends : len(t) - ends : decimate])
-    absent = dict.fromkeys(("p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity"))
+            arrays["temperature"] = np.transpose(slow)
+        parts.append({key: array[ends : len(t) - ends : decimate] for key, array in arrays.items()})
     smoothed = data._replace(
-        **absent,
-        **{key: np.concatenate(parts) for key, parts in columns.items()},
-        trajectory=np.repeat(np.arange(len(long)), [len(t) for t in columns["t"]]),
+        **dict.fromkeys(sampling.DROPPED),
+        **{key: np.concatenate([part[key] for part in parts]) for key in parts[0]},
+        trajectory=np.repeat(np.arange(len(long)), [len(part["t"]) for part in parts]),
         label=_labels(data, [int(data.trajectory[piece[0]]) for piece, _, _ in long]),
         estimated=tuple(key for key in data.estimated if key == "tau"),
     )
     share = np.sqrt(min(1.0, 2 * cutoff / rate)) if filtered else 1.0
     return Smoothed(
-        smoothed, cutoff, rate, noise_q, noise_tau * share, choice, filtered, decimate, trim, len(long),
-        left_out=len(pieces) - len(long), repeats=repeats, clock=clock,
-    )  # fmt: skip
+        smoothed,
+        cutoff,
+        rate,
+        noise_q,
+        noise_tau * share,
+        choice,
+        filtered,
+        decimate,
+        trim,
+        len(long),
+        left_out=len(pieces) - len(long),
+        repeats=repeats,
+        clock=clock,
+    )
 
 
 def _labels(data: Trajectories, sources: list[int]) -> np.ndarray:
@@ -204,13 +213,14 @@ def smooth_locally(data: Trajectories) -> LocalRates:
     most = min(MOST_POINTS, *map(len, parts))
     while (longer := 2 * int(np.ceil((GROWTH * sizes[-1] - 1) / 2)) + 1) <= most:
         sizes.append(longer)
-    fits = [
-        np.concatenate([_polynomials(data.t[part], data.q[part], min(size, most)) for part in parts], axis=1)
-        for size in sizes
-    ]
-    best = np.argmin([np.mean(left_out**2, axis=0) for _, _, _, left_out, _ in fits], axis=0)
-    chosen = np.stack([fits[size][..., joint] for joint, size in enumerate(best)], axis=2)
-    q, qd, qdd, _, variance = chosen
+    fits = np.array(
+        [
+            np.concatenate([_polynomials(data.t[part], data.q[part], min(size, most)) for part in parts], axis=1)
+            for size in sizes
+        ]
+    )
+    best = np.argmin(np.mean(fits[:, 3] ** 2, axis=1), axis=0)
+    q, qd, qdd, _, variance = np.moveaxis(fits[best, ..., np.arange(len(best))], 0, -1)
     rows = np.concatenate(parts)
     smoothed = select_samples(data, rows)._replace(q=q, qd=qd, qdd=qdd)
     return LocalRates(smoothed, np.sqrt(np.mean(variance, axis=0)), best > 0, rows)
@@ -226,7 +236,7 @@ def _polynomials(t: np.ndarray, q: np.ndarray, size: int) -> Float[np.ndarray, "
     unit = 0.5 * (t[-1] - t[0]) * size / len(t)
     powers = ((t[around] - t[:, None]) / unit)[..., None] ** np.arange(DEGREE + 1)
     # The normal equations are safe here: the matrices are small and times are scaled.
-    inverse = np.linalg.solve(powers.transpose(0, 2, 1) @ powers, powers.transpose(0, 2, 1))
+    inverse = np.linalg.solve(powers.mT @ powers, powers.mT)
     value, slope, bend = (np.einsum("ns,nsd->nd", inverse[:, order], q[around]) for order in range(3))
     own = 1 - inverse[np.arange(len(t)), 0, np.arange(len(t)) - first][:, None]
     residual = q - value
