@@ -18,8 +18,15 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import DTypeLike
 
-from dln_jax.mechanics.friction.curves import joint_dissipation, require_shape
-from dln_jax.mechanics.friction.laws import FrictionCoefficients, FrictionShape, coefficients_of, require_laws, shape_of
+from dln_jax.mechanics.friction import (
+    FrictionCoefficients,
+    FrictionShape,
+    coefficients_of,
+    joint_dissipation,
+    require_laws,
+    require_shape,
+    shape_of,
+)
 from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, Needs

@@ -7,11 +7,30 @@ import pytest
 from planar_arm import ARM, FRICTION, LENGTH, motions
 
 from dln_jax.data.splits import select
-from dln_jax.identification.base import base_parameters, determinacy, in_words, null_directions
 from dln_jax.identification.consistent import fit_consistent, is_consistent, nearest_body
-from dln_jax.identification.equations import columns_of, compress, flat, regressor_of, squares, whiten
-from dln_jax.identification.identify import identify, parameters_of, random_states
-from dln_jax.identification.report import base_rows, findings, lost, parameter_rows, summary, text
+from dln_jax.identification.equations import (
+    base_parameters,
+    columns_of,
+    compress,
+    determinacy,
+    flat,
+    in_words,
+    null_directions,
+    regressor_of,
+    squares,
+    whiten,
+)
+from dln_jax.identification.identify import (
+    base_rows,
+    findings,
+    identify,
+    lost,
+    parameter_rows,
+    parameters_of,
+    random_states,
+    summary,
+    text,
+)
 from dln_jax.identification.residual import Candidate, fit_residual
 from dln_jax.identification.weighted import fit_weighted
 from dln_jax.learning.linear import fit_linear

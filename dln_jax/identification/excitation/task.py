@@ -16,12 +16,13 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.identification.base import unit_columns
+from dln_jax.identification.equations import NEGLIGIBLE
 from dln_jax.identification.excitation.fourier import rest_basis
 from dln_jax.identification.excitation.limits import Clearance, Excess, MotionLimits, excess, require_limits
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters, linearised
 from dln_jax.precision import require_double_precision
+from dln_jax.solvers.least_squares import scaled_columns
 from dln_jax.types import InputError, require_positive, require_seed
 
 SAMPLES = 20
@@ -138,8 +139,8 @@ def independent_columns(A: Float[np.ndarray, "N P"]) -> Int[np.ndarray, " B"]:
     """Sorted indices of independent columns that span all others, by QR with pivoting of unit-length columns."""
     from scipy.linalg import qr
 
-    scaled, lengths = unit_columns(A)
-    if not lengths.any():
+    scaled, _ = scaled_columns(A, NEGLIGIBLE)
+    if not scaled.any():
         return np.zeros(0, int)
     factors: Any = qr(scaled, mode="r", pivoting=True)
     triangle, order = factors[-2:]
