@@ -13,6 +13,8 @@ method with a regularisation that falls to the requested value. The data enter a
 takes on the order of P³ operations, independent of the number of samples N.
 """
 
+from collections.abc import Sequence
+from itertools import combinations_with_replacement
 from typing import NamedTuple
 
 import numpy as np
@@ -35,11 +37,8 @@ CENTRED = 0.1
 """An intermediate minimum counts as reached at this Newton decrement, in units of the regularisation."""
 TOLERANCE = 1e-10
 """The search stops at this Newton decrement (expected decrease of F in another iteration), relative to 1 + F."""
-_ABOVE = np.triu_indices(4, 1)
-_BASIS = np.array(
-    [np.outer(row, row) for row in np.eye(4)]
-    + [(np.outer(a, b) + np.outer(b, a)) / np.sqrt(2) for a, b in zip(*np.eye(4)[np.array(_ABOVE)], strict=True)]
-)
+_SYMMETRIC = np.array([np.outer(a, b) + np.outer(b, a) for a, b in combinations_with_replacement(np.eye(4), 2)])
+_BASIS = _SYMMETRIC / np.linalg.norm(_SYMMETRIC, axis=(1, 2), keepdims=True)
 """Orthonormal basis of the symmetric matrices [10, 4, 4]."""
 
 
@@ -64,20 +63,16 @@ def _armature(theta: np.ndarray, entries: list[tuple[int, int, int]]) -> np.ndar
     return A
 
 
-def is_consistent(theta: Float[np.ndarray, " P"], columns: Columns) -> tuple[bool, ...]:
-    """Whether the pseudo-inertia of every body is positive definite; a body with ten zeros counts as consistent."""
-    bodies = theta[columns.bodies]
-    return tuple(bool(not body.any() or np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0) for body in bodies)
-
-
 def nearest_body(theta: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
     """Raises the eigenvalues of a pseudo-inertia to `SMALLEST` times the largest; `InputError` if none is positive."""
-    values, vectors = np.linalg.eigh(pseudo_inertia(np.asarray(theta, float)))
-    if not values[-1] > 0:
+    theta = np.asarray(theta, float)
+    values, vectors = np.linalg.eigh(pseudo_inertia(theta))
+    least = SMALLEST * values[-1]
+    if not least > 0:
         raise InputError("a link that is to be identified has no mass; expected a rough value for it")
-    if values[0] >= SMALLEST * values[-1]:
-        return np.asarray(theta, float)
-    return np.asarray(body_of_pseudo_inertia((vectors * np.maximum(values, SMALLEST * values[-1])) @ vectors.T))
+    if values[0] >= least:
+        return theta
+    return np.asarray(body_of_pseudo_inertia((vectors * np.maximum(values, least)) @ vectors.T))
 
 
 def fit_consistent(
@@ -101,43 +96,30 @@ def fit_consistent(
         InputError: `regularisation` is not positive, or a body has no mass.
     """
     require_positive(regularisation=regularisation)
-    kinds, identity = np.array(columns.kinds), np.eye(len(columns.kinds))
+    kinds, entries = np.array(columns.kinds), columns.motors
+    motors = [column for column, *_ in entries]
     inertial = columns.bodies[known[columns.bodies].any(axis=1)]
-    positive, signed = (np.flatnonzero(kinds == kind) for kind in ("positive", "signed"))
     lengths = np.linalg.norm(triangle[:, :-1], axis=0)
     typical = np.linalg.norm(triangle[:, -1]) / np.where(lengths > 0, lengths, np.inf)
     typical = np.where(typical > 0, typical, 1.0)
-    start = np.zeros(len(kinds))
-    start[positive] = np.where(known[positive] > 0, known[positive], UNKNOWN_SHARE * typical[positive])
-    start[signed] = known[signed]
-    # Columns of the map to theta: those of every block, then the positive coefficients, then the signed ones.
-    maps, bases = [], []
+    start = np.where((kinds == "positive") & ~(known > 0), UNKNOWN_SHARE * typical, known)
+    to_theta, blocks = np.diag(np.where(kinds == "signed", typical, start)), []
     for places in inertial:
         J = pseudo_inertia(nearest_body(known[places]))
         start[places], factor = np.asarray(body_of_pseudo_inertia(J)), np.linalg.cholesky(J)
         directions = [np.asarray(body_of_pseudo_inertia(factor @ E @ factor.T)) for E in _BASIS]
-        maps.append(identity[:, places] @ np.stack(directions, axis=1))
-        bases.append(_BASIS)
-    if entries := columns.motors:
-        places = [column for column, *_ in entries]
-        start[places] = [start[column] if i == j else known[column] for column, i, j in entries]
+        to_theta[np.ix_(places, places)] = np.stack(directions, axis=1)
+        blocks.append((places, _BASIS))
+    if entries:
         if not np.linalg.eigvalsh(_armature(start, entries))[0] > 0:
-            start[places] = [start[column] if i == j else 0.0 for column, i, j in entries]
-        factor = np.linalg.cholesky(_armature(start, entries))
-        back = np.linalg.inv(factor)
-        units = [_armature(identity[column], entries) for column in places]
-        relative = np.stack([back @ unit @ back.T for unit in units])
-        lengths_of = np.linalg.norm(relative, axis=(1, 2))
-        maps.append(identity[:, places] / lengths_of)
-        bases.append(relative / lengths_of[:, None, None])
-    positive = np.setdiff1d(positive, [column for column, *_ in columns.motors])
-    to_theta = np.hstack([*maps, identity[:, positive] * start[positive], identity[:, signed] * typical[signed]])
-    A, r = triangle[:, :-1] @ to_theta, triangle[:, :-1] @ start - triangle[:, -1]
-    blocks, first = [], 0
-    for basis in bases:
-        blocks.append((slice(first, first + len(basis)), basis))
-        first += len(basis)
-    problem = _Problem(A, r, tuple(blocks), slice(first, first + len(positive)))
+            start[kinds == "coupling"] = 0.0
+        back = np.linalg.inv(np.linalg.cholesky(_armature(start, entries)))
+        relative = np.stack([back @ _armature(unit, entries) @ back.T for unit in np.eye(len(kinds))[motors]])
+        sizes = np.linalg.norm(relative, axis=(1, 2))
+        to_theta[motors, motors] = 1 / sizes
+        blocks.append((motors, relative / sizes[:, None, None]))
+    z = np.setdiff1d(np.flatnonzero(kinds == "positive"), motors)
+    problem = _Problem(triangle[:, :-1] @ to_theta, triangle[:, :-1] @ start - triangle[:, -1], blocks, z)
     x, done, converged = _minimum(problem, regularisation, iterations)
     divergences = _divergences(problem.blocks_of(x)[: len(inertial)])
     return ConsistentFit(start + to_theta @ problem.directions(x), divergences, done, converged)
@@ -148,9 +130,9 @@ class _Problem(NamedTuple):
 
     A: np.ndarray
     r: np.ndarray
-    blocks: tuple[tuple[slice, np.ndarray], ...]
+    blocks: list[tuple[Sequence[int] | np.ndarray, np.ndarray]]
     """Places in x, and basis [K, n, n], of every body and of the coupled motors."""
-    z: slice
+    z: np.ndarray
     """Places of z in the unknowns x, which hold it in place of exp(z) - 1."""
 
     def blocks_of(self, x: np.ndarray) -> list[np.ndarray]:
@@ -176,18 +158,15 @@ class _Problem(NamedTuple):
         z, errors = x[self.z], self.A @ self.directions(x) + self.r
         slopes = self.A.copy()
         slopes[:, self.z] *= np.exp(z)
-        rows, right = [slopes], [-errors]
+        # The curvature of exp(z) enters only where it is positive, so that the step remains a descent direction.
+        bend = np.sqrt(weight / 2 + np.maximum(slopes[:, self.z].T @ errors, 0.0))
+        rows, right = [slopes, bend[:, None] * np.eye(len(x))[self.z]], [-errors, -weight / 2 * z / bend]
         for (own, basis), M in zip(self.blocks, self.blocks_of(x), strict=True):
-            C = np.linalg.cholesky(M)
+            C, block = np.linalg.cholesky(M), np.zeros((M.size, len(x)))
             inner = np.linalg.solve(C, np.linalg.solve(C, basis).transpose(0, 2, 1))
-            block = np.zeros((M.size, len(x)))
             block[:, own] = inner.reshape(len(basis), M.size).T
             rows.append(np.sqrt(weight / 2) * block)
             right.append(-np.sqrt(weight / 2) * (C.T @ C - np.eye(len(M))).ravel())
-        # The curvature of exp(z) enters only where it is positive, so that the step remains a descent direction.
-        bend = np.sqrt(weight / 2 + np.maximum(slopes[:, self.z].T @ errors, 0.0))
-        rows.append(bend[:, None] * np.eye(len(x))[self.z])
-        right.append(-weight / 2 * z / bend)
         system = np.concatenate(rows)
         step = np.linalg.lstsq(system, np.concatenate(right), rcond=None)[0]
         return step, float(np.sum((system @ step) ** 2))
@@ -196,7 +175,7 @@ class _Problem(NamedTuple):
 def _minimum(problem: _Problem, regularisation: float, iterations: int) -> tuple[np.ndarray, int, bool]:
     """The unknowns that minimise F, the number of iterations, and whether they converged."""
     x = np.zeros(problem.A.shape[1])
-    weight = max(regularisation, problem.value(x, 0.0) / max(1, len(x)))
+    weight = max(regularisation, problem.value(x, 0.0) / len(x))
     for done in range(iterations):
         step, decrement = problem.newton(x, weight)
         now, last = problem.value(x, weight), weight == regularisation

@@ -218,19 +218,18 @@ def base_parameters(A: Float[np.ndarray, "N P"], columns: Columns) -> BaseParame
     combinations = factors * lengths / lengths[independent][:, None]
     combinations[abs(factors) < SHOWN * abs(factors).max(axis=1, initial=0.0)[:, None]] = 0.0
     combinations[:, independent] = np.eye(len(independent))
-    words = tuple(in_words(row, columns.names) for row in combinations)
+    words = tuple(in_words(row, columns.names, column) for row, column in zip(combinations, independent, strict=True))
     return BaseParameters(combinations, tuple(independent), words)
 
 
-def in_words(combination: Float[np.ndarray, " P"], names: Sequence[str]) -> str:
-    """Writes a combination as a sum, starting with the names that have factor 1."""
-    chosen = sorted(np.flatnonzero(combination).tolist(), key=lambda column: (abs(combination[column] - 1) > SHOWN, column))
-    text = ""
-    for column in chosen:
+def in_words(combination: Float[np.ndarray, " P"], names: Sequence[str], first: int) -> str:
+    """Writes a combination as a sum, starting with this column, whose factor is 1."""
+    others = np.flatnonzero(combination)
+    text = names[first]
+    for column in others[others != first]:
         factor = combination[column]
         size = "" if abs(abs(factor) - 1) < SHOWN else f"{abs(factor):.4g} "
-        sign = ("-" if factor < 0 else "") if not text else (" - " if factor < 0 else " + ")
-        text += f"{sign}{size}{names[column]}"
+        text += f" {'-' if factor < 0 else '+'} {size}{names[column]}"
     return text
 
 
