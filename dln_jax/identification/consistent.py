@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.identification.equations import Columns
+from dln_jax.identification.equations import Columns, ParameterVector
 from dln_jax.mechanics.trees.inertia import body_of_pseudo_inertia, pseudo_inertia
 from dln_jax.types import InputError, require_positive
 
@@ -45,7 +45,7 @@ _BASIS = _SYMMETRIC / np.linalg.norm(_SYMMETRIC, axis=(1, 2), keepdims=True)
 class ConsistentFit(NamedTuple):
     """Physically consistent parameters and how the solver ended."""
 
-    theta: Float[np.ndarray, " P"]
+    theta: ParameterVector
     divergence: Float[np.ndarray, " bodies"]
     """D(J | J_0) of every body with inertia."""
     iterations: int
@@ -78,7 +78,7 @@ def nearest_body(theta: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
 def fit_consistent(
     triangle: Float[np.ndarray, "K P_and_1"],
     columns: Columns,
-    known: Float[np.ndarray, " P"],
+    known: ParameterVector,
     *,
     regularisation: float = REGULARISATION,
     iterations: int = 500,

@@ -31,6 +31,8 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers.least_squares import scaled_columns
 from dln_jax.types import InputError
 
+ParameterVector = Float[np.ndarray, " P"]
+JointVector = Float[np.ndarray, " d"]
 Kind = Literal["inertia", "positive", "signed", "coupling"]
 Determinacy = Literal["alone", "in combination", "not at all"]
 PREFERRED = ("I_zz", "h_x", "h_y", "I_xx", "I_xy", "I_xz", "I_yz", "I_yy", "h_z", "m")
@@ -62,8 +64,6 @@ class Columns(NamedTuple):
     kinds: tuple[Kind, ...]
     """"inertia" for the ten columns of a body, "positive" for armature and friction, "signed" for either sign,
     "coupling" for the armature between two motors."""
-    joints: tuple[int, ...]
-    """Joint of every column, counted from 0, the second one of a coupling."""
 
     @property
     def bodies(self) -> Int[np.ndarray, "bodies 10"]:
@@ -83,20 +83,20 @@ class Columns(NamedTuple):
 
 def columns_of(parameters: Parameters) -> Columns:
     """Columns of a model with these parameters; outside `inertias` a column is named by its leaf and place in it."""
-    rows: list[tuple[str, Kind, int]] = []
+    rows: list[tuple[str, Kind]] = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(parameters):
         name = jax.tree_util.keystr(path, simple=True, separator="_")
         if name.startswith(COUPLING):
-            rows.append((name, "coupling", int(name.rpartition("_")[2]) - 1))
+            rows.append((name, "coupling"))
         elif name == BODIES and np.shape(leaf)[1:] == (len(PARAMETERS),):
-            rows += [(f"{own}_{joint + 1}", "inertia", joint) for joint in range(len(leaf)) for own in PARAMETERS]
+            rows += [(f"{own}_{joint + 1}", "inertia") for joint in range(len(leaf)) for own in PARAMETERS]
         else:
             kind: Kind = "signed" if name.endswith(SIGNED) else "positive"
-            rows += [(f"{name}_{joint + 1}", kind, joint) for joint in range(np.size(leaf))]
+            rows += [(f"{name}_{joint + 1}", kind) for joint in range(np.size(leaf))]
     return Columns(*zip(*rows, strict=True))
 
 
-def flat(parameters: Parameters) -> Float[np.ndarray, " P"]:
+def flat(parameters: Parameters) -> ParameterVector:
     """Concatenates all parameters in the order of the columns."""
     leaves: list[Any] = [np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(parameters)]
     return np.concatenate(leaves)
@@ -163,17 +163,17 @@ def compress(regressor: Regressor, weights: Float[np.ndarray, "N d"] | None = No
     return Equations(triangles, samples)
 
 
-def whiten(equations: Equations, noise: Float[np.ndarray, " d"]) -> Float[np.ndarray, "K P_and_1"]:
+def whiten(equations: Equations, noise: JointVector) -> Float[np.ndarray, "K P_and_1"]:
     """One triangular factor of all joints, with rows in units of the joint's noise."""
     return np.linalg.qr(np.concatenate(equations.triangles / noise[:, None, None]), mode="r")
 
 
-def squares(equations: Equations, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, " d"]:
+def squares(equations: Equations, theta: ParameterVector) -> JointVector:
     """Sum of squared residuals over the samples, per joint."""
     return np.sum((equations.triangles @ np.append(theta, -1.0)) ** 2, axis=1)
 
 
-def residuals(regressor: Regressor, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, "N d"]:
+def residuals(regressor: Regressor, theta: ParameterVector) -> Float[np.ndarray, "N d"]:
     """tau - Phi theta of every sample."""
     return np.concatenate([tau - columns @ theta for columns, tau in regressor()])
 
@@ -190,29 +190,17 @@ class BaseParameters(NamedTuple):
 
 
 def base_parameters(A: Float[np.ndarray, "N P"], columns: Columns) -> BaseParameters:
-    """Finds the base parameters by Gram-Schmidt with reorthogonalisation.
+    """Finds the base parameters by the triangular factor of the columns in their order of preference.
 
     Args:
         A: Phi in generic states, more of them than parameters, or its triangular factor.
-        columns: names, kinds and joints of the columns.
+        columns: names and kinds of the columns.
     """
-
-    def preference(column: int) -> tuple[bool, int, int]:
-        name, body = columns.names[column], columns.kinds[column] == "inertia"
-        return (not body, columns.joints[column], PREFERRED.index(name.rpartition("_")[0]) if body else column)
-
+    preferred = columns.bodies[:, [PARAMETERS.index(name) for name in PREFERRED]]
+    order = np.append(preferred, np.flatnonzero(np.array(columns.kinds) != "inertia"))
     scaled, lengths = scaled_columns(A, NEGLIGIBLE)
-    basis = np.zeros((len(A), 0))
-    independent: list[int] = []
-    for column in sorted(range(len(columns.names)), key=preference):
-        remainder = scaled[:, column]
-        for _ in range(2):
-            remainder = remainder - basis @ (basis.T @ remainder)
-        length = np.linalg.norm(remainder)
-        if length > DEPENDENT:
-            basis = np.column_stack([basis, remainder / length])
-            independent.append(column)
-    independent.sort()
+    remainders = np.diagonal(np.linalg.qr(scaled[:, order], mode="r"))
+    independent = np.sort(order[abs(remainders) > DEPENDENT]).tolist()
     # Solve with columns of unit length, then scale back.
     factors = np.linalg.lstsq(scaled[:, independent], scaled, rcond=None)[0]
     combinations = factors * lengths / lengths[independent][:, None]
@@ -222,7 +210,7 @@ def base_parameters(A: Float[np.ndarray, "N P"], columns: Columns) -> BaseParame
     return BaseParameters(combinations, tuple(independent), words)
 
 
-def in_words(combination: Float[np.ndarray, " P"], names: Sequence[str], first: int) -> str:
+def in_words(combination: ParameterVector, names: Sequence[str], first: int) -> str:
     """Writes a combination as a sum, starting with this column, whose factor is 1."""
     others = np.flatnonzero(combination)
     text = names[first]

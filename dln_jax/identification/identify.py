@@ -6,7 +6,6 @@ from typing import Any, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.identification import equations
@@ -15,6 +14,8 @@ from dln_jax.identification.equations import (
     BaseParameters,
     Columns,
     Determinacy,
+    JointVector,
+    ParameterVector,
     columns_of,
     compress,
     flat,
@@ -42,7 +43,7 @@ class Identification(NamedTuple):
     """Result of an identification of P parameters."""
 
     columns: Columns
-    known: Float[np.ndarray, " P"]
+    known: ParameterVector
     """Prior values."""
     structure: tuple[Determinacy, ...]
     """Structural identifiability: how arbitrary motions could determine every parameter."""
@@ -52,13 +53,13 @@ class Identification(NamedTuple):
     """Least-squares fit to the data; its bodies may be physically inconsistent."""
     seen: tuple[Determinacy, ...]
     """How these data determine every parameter."""
-    correlation: Float[np.ndarray, " d"]
+    correlation: JointVector
     """Correlation time of every joint's residuals of `fit`, in samples."""
     consistent: ConsistentFit | None
     """Physically consistent parameters, if requested."""
 
     @property
-    def theta(self) -> Float[np.ndarray, " P"]:
+    def theta(self) -> ParameterVector:
         """The physically consistent parameters if computed, otherwise those of least squares."""
         return self.fit.theta if self.consistent is None else self.consistent.theta
 
@@ -142,7 +143,7 @@ def seen_by(fit: WeightedFit, base: BaseParameters, structure: tuple[Determinacy
     )  # fmt: skip
 
 
-def parameters_of(theta: Float[np.ndarray, " P"], like: Parameters) -> Parameters:
+def parameters_of(theta: ParameterVector, like: Parameters) -> Parameters:
     """Parameters of the model from a vector in the order of its columns."""
     return jax.tree.map(jnp.asarray, unravelled(theta, like))
 

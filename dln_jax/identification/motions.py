@@ -30,7 +30,7 @@ from jaxtyping import Float
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.identification.consistent import fit_consistent
-from dln_jax.identification.equations import Columns
+from dln_jax.identification.equations import Columns, JointVector, ParameterVector
 from dln_jax.learning.linear import unravelled
 from dln_jax.learning.shooting import MeasuredWindows, cut_measured_windows, motion, without_start
 from dln_jax.mechanics.equations import dynamics
@@ -55,7 +55,7 @@ TYPICAL_DELAY = 1e-3
 class MotionFit(NamedTuple):
     """Parameters that fit motions."""
 
-    theta: Float[np.ndarray, " P"]
+    theta: ParameterVector
     delay: float
     """Delay of the motions behind the logged torques, s."""
     before: float
@@ -119,18 +119,17 @@ def linearise(model: Model) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
 
 @functools.lru_cache(maxsize=4)
 def _damping(model: Model) -> Callable[..., Array]:
-    """(theta [P], q [n, T, d], qd [n, T, d], tau [n, T, d]) -> d qdd / d qd [n, T, d, d]."""
+    """(theta [P], q [n, d], qd [n, d], tau [n, d]) -> d qdd / d qd [n, d, d]."""
     like = jax.eval_shape(model.init, jax.random.key(0))
 
-    def slopes(theta: Array, q: Array, qd: Array, tau: Array) -> Array:
-        system = dynamics(model.energies(unravelled(theta, like)))
-        return jax.jacfwd(system.forward_dynamics, argnums=1)(q, qd, tau)
+    def slopes(theta: Array, *state: Array) -> Array:
+        forward_dynamics = dynamics(model.energies(unravelled(theta, like))).forward_dynamics
+        return jax.jacfwd(forward_dynamics, argnums=1)(*state)
 
-    along = jax.vmap(jax.vmap(slopes, in_axes=(None, 0, 0, 0)), in_axes=(None, 0, 0, 0))
-    return jax.jit(along, compiler_options=quick_compilation())
+    return jax.jit(jax.vmap(slopes, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
 
 
-def _require_resolved(model: Model, theta: Float[np.ndarray, " P"], windows: MeasuredWindows) -> None:
+def _require_resolved(model: Model, theta: ParameterVector, windows: MeasuredWindows) -> None:
     """Raises `InputError` if derivatives of most windows grow without bound, as with steep dry friction near rest.
 
     A classical Runge-Kutta step multiplies a deviation that decays as exp(-z) by 1 - z + z²/2 - z³/6 + z⁴/24, which
@@ -139,12 +138,12 @@ def _require_resolved(model: Model, theta: Float[np.ndarray, " P"], windows: Mea
     step = float(np.median(np.diff(windows.t, axis=1)[windows.weight[:, 1:] > 0]))
     rows = np.linspace(0, len(windows.t) - 1, CHUNK).astype(int)  # one shape, so one program
     with jax.enable_x64(True):
-        states = (jnp.asarray(array[rows]) for array in (windows.q, windows.qd, windows.tau))
-        damping = np.asarray(_damping(model)(jnp.asarray(theta), *states))
+        states = (np.concatenate(array[rows]) for array in (windows.q, windows.qd, windows.tau))
+        damping = np.asarray(_damping(model)(theta, *states))
     if not np.isfinite(damping).all():
         return  # the motions are not finite either, which has a message of its own
     z = step * np.abs(np.linalg.eigvals(damping)).max(axis=-1)
-    growth = np.prod(np.maximum(np.abs(1 - z + z**2 / 2 - z**3 / 6 + z**4 / 24), 1.0), axis=1)
+    growth = np.maximum(np.abs(1 - z + z**2 / 2 - z**3 / 6 + z**4 / 24), 1.0).reshape(CHUNK, -1).prod(axis=1)
     if np.median(growth) > MOST_GROWTH:
         raise InputError(
             f"friction acts up to {z.max() / STABLE:.3g} times faster than the log's step of {step:.3g} s resolves; "
@@ -155,12 +154,12 @@ def _require_resolved(model: Model, theta: Float[np.ndarray, " P"], windows: Mea
 def fit_motions(
     model: Model,
     columns: Columns,
-    prior: Float[np.ndarray, " P"],
-    start: Float[np.ndarray, " P"],
+    prior: ParameterVector,
+    start: ParameterVector,
     windows: MeasuredWindows,
     slope: Float[np.ndarray, "W T d"],
     *,
-    noise_tau: Float[np.ndarray, " d"],
+    noise_tau: JointVector,
     torques: Float[np.ndarray, "K P_and_1"] | None = None,
     reweightings: int = REWEIGHTINGS,
 ) -> MotionFit:
@@ -191,7 +190,7 @@ def fit_motions(
         left = linearised(x, noise_q, noise_tau, windows, slope)[0][:, : samples * d]
         sizes = np.sum(left.reshape(-1, d) ** 2, axis=0) / measured
         noise_q = np.maximum(noise_q * np.sqrt(sizes), 1e-3 * spread)
-    wider = Columns((*columns.names, "delay"), (*columns.kinds, "signed"), (*columns.joints, 0))
+    wider = Columns((*columns.names, "delay"), (*columns.kinds, "signed"))
     fixed = np.zeros((0, P + 2)) if torques is None else np.insert(torques, P, 0.0, axis=1)
 
     def at(x: np.ndarray, weight: np.ndarray = windows.weight) -> tuple[np.ndarray, np.ndarray, float]:

@@ -26,7 +26,7 @@ from dln_jax.compilation import quick_compilation
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import BLOCKS, every, in_blocks
-from dln_jax.identification.equations import DEPENDENT, NEGLIGIBLE
+from dln_jax.identification.equations import determinacy, null_directions
 from dln_jax.identification.identify import STATES, random_states
 from dln_jax.learning.friction import (
     FrictionFit,
@@ -45,7 +45,6 @@ from dln_jax.mechanics.trees.description import Tree, tree_to_json
 from dln_jax.mechanics.trees.motors import Pair
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.trees import Rows
-from dln_jax.solvers.least_squares import scaled_columns
 from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import Description, build, describe
 
@@ -133,10 +132,7 @@ def is_identifiable(tree: Tree, motors: Rows | None, pair: Pair) -> bool:
     states = random_states(tree.joints, STATES * tree.degrees_of_freedom, 0)
     with jax.enable_x64(True):
         links = known_of(tree, states, Terms((), motors=motors, coupled=(pair,)), noise=1.0).links
-    A = scaled_columns(np.asarray(links).reshape(-1, links.shape[2]), NEGLIGIBLE)[0]
-    others, column = A[:, :-1], A[:, -1]
-    left = column - others @ np.linalg.lstsq(others, column, rcond=DEPENDENT)[0]
-    return bool(np.linalg.norm(left) > np.sqrt(DEPENDENT))
+    return determinacy(null_directions(np.asarray(links).reshape(-1, links.shape[2])))[-1] == "alone"
 
 
 class TriedTerm(NamedTuple):

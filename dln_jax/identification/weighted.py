@@ -13,7 +13,17 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.identification.equations import NEGLIGIBLE, Equations, Regressor, compress, residuals, squares, whiten
+from dln_jax.identification.equations import (
+    NEGLIGIBLE,
+    Equations,
+    JointVector,
+    ParameterVector,
+    Regressor,
+    compress,
+    residuals,
+    squares,
+    whiten,
+)
 from dln_jax.solvers.least_squares import scaled_columns
 from dln_jax.types import InputError
 
@@ -34,10 +44,10 @@ REWEIGHTINGS, SETTLED = 30, 1e-4
 class WeightedFit(NamedTuple):
     """Least-squares fit of P parameters to d joints."""
 
-    theta: Float[np.ndarray, " P"]
+    theta: ParameterVector
     covariance: Float[np.ndarray, "P P"]
     """Includes every direction with an effect on the data, even those too weak to be used in the fit."""
-    noise: Float[np.ndarray, " d"]
+    noise: JointVector
     """Standard deviation of the residual of each joint, N m or N."""
     rank: int
     """Number of combinations that the data determine."""
@@ -47,7 +57,7 @@ class WeightedFit(NamedTuple):
     """Orthonormal directions along which theta keeps its prior value, in units of the columns' lengths."""
     without_effect: Float[np.ndarray, "M P"]
     """Returns the directions of `unseen` that have no effect on the data."""
-    lengths: Float[np.ndarray, " P"]
+    lengths: ParameterVector
     """Lengths of the columns in units of noise; zero for columns without effect."""
 
     def standard_errors(self, combinations: Float[np.ndarray, "B P"]) -> Float[np.ndarray, " B"]:
@@ -60,10 +70,10 @@ class WeightedFit(NamedTuple):
 
 def fit_weighted(
     data: Equations,
-    known: Float[np.ndarray, " P"],
+    known: ParameterVector,
     *,
-    noise: Float[np.ndarray, " d"] | None = None,
-    correlation: Float[np.ndarray, " d"] | None = None,
+    noise: JointVector | None = None,
+    correlation: JointVector | None = None,
 ) -> WeightedFit:
     """Fits the parameters by weighted least squares.
 
@@ -129,26 +139,26 @@ def _solve(
     return fit, np.sum(by_joint[:, :, :rank] ** 2, axis=(1, 2))
 
 
-def correlation_times(errors: Float[np.ndarray, "N d"], trajectory: np.ndarray) -> Float[np.ndarray, " d"]:
+def correlation_times(errors: Float[np.ndarray, "N d"], trajectory: np.ndarray) -> JointVector:
     """Correlation time of every joint's residuals in samples; 1 for independent ones.
 
     1 + 2 sum of autocorrelations within trajectories, up to the first pair of lags whose sum is not positive (Geyer
     1992).
     """
+    from scipy.signal import fftconvolve
+
     parts = np.split(errors, np.flatnonzero(np.diff(trajectory)) + 1)
     longest = max(len(part) for part in parts)
     products = np.zeros((longest, errors.shape[1]))
     for part in parts:
-        # Zero padding to twice the length keeps the correlation from wrapping round.
-        spectrum = abs(np.fft.rfft(part, 2 * len(part), axis=0)) ** 2
-        products[: len(part)] += np.fft.irfft(spectrum, 2 * len(part), axis=0)[: len(part)]
+        products[: len(part)] += fftconvolve(part, part[::-1], axes=0)[len(part) - 1 :]
     correlations = products / np.where(products[0] > 0, products[0], 1.0)
     pairs = correlations[: 2 * (longest // 2)].reshape(-1, 2, errors.shape[1]).sum(axis=1)
     ended = np.logical_or.accumulate(pairs <= 0, axis=0)
     return np.maximum(2 * np.sum(np.where(ended, 0.0, pairs), axis=0) - 1, 1.0)  # the pairs include lag 0, which is 1
 
 
-def fit_robust(regressor: Regressor, known: Float[np.ndarray, " P"]) -> tuple[WeightedFit, Float[np.ndarray, "N d"]]:
+def fit_robust(regressor: Regressor, known: ParameterVector) -> tuple[WeightedFit, Float[np.ndarray, "N d"]]:
     """Huber's estimate: the loss grows linearly instead of quadratically beyond `THRESHOLD` times the noise.
 
     Iteratively reweighted least squares with weights min(1, threshold noise / |error|), returned with the fit; the

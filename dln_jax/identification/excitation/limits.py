@@ -61,11 +61,12 @@ def require_limits(limits: MotionLimits, degrees_of_freedom: int, names: tuple[s
             raise InputError(f"limits of {kind} have shape {array.shape}; expected {shape}")
         for joint, limit in enumerate(array):
             name = names[joint] if names else str(joint)
-            if np.isnan(limit).any() or (kind != "force" and np.isinf(limit).any()):
+            low, high = limit if len(shape) == 2 else (0.0, limit)
+            if np.isnan([low, high]).any() or (kind != "force" and np.isinf(low - high)):
                 raise InputError(f"joint '{name}' has no limit of {kind}; state one")
-            if np.isinf(limit).any() and not (limit[0] == -np.inf and limit[1] == np.inf):
+            if np.isinf(low) != np.isinf(high):
                 raise InputError(f"joint '{name}' has a limit of {kind} on one side, {limit}; expected both or none")
-            if not (limit[0] < limit[1] if len(shape) == 2 else limit > 0):
+            if not low < high:
                 raise InputError(f"joint '{name}' has limits of {kind} {limit}; expected lower < upper, and rates > 0")
 
 
