@@ -13,7 +13,6 @@ method with a regularisation that falls to the requested value. The data enter a
 takes on the order of P³ operations, independent of the number of samples N.
 """
 
-from collections.abc import Sequence
 from itertools import combinations_with_replacement
 from typing import NamedTuple
 
@@ -54,15 +53,6 @@ class ConsistentFit(NamedTuple):
     """Whether the Newton decrement fell below the tolerance; otherwise the iterations or the line search ran out."""
 
 
-def _armature(theta: np.ndarray, entries: list[tuple[int, int, int]]) -> np.ndarray:
-    """Armature matrix of coupled motors, without the others."""
-    motors = sorted({motor for _, motor, _ in entries})
-    A = np.zeros((len(motors), len(motors)))
-    for column, i, j in entries:
-        A[motors.index(i), motors.index(j)] = A[motors.index(j), motors.index(i)] = theta[column]
-    return A
-
-
 def nearest_body(theta: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
     """Raises the eigenvalues of a pseudo-inertia to `SMALLEST` times the largest; `InputError` if none is positive."""
     theta = np.asarray(theta, float)
@@ -97,7 +87,7 @@ def fit_consistent(
     """
     require_positive(regularisation=regularisation)
     kinds, entries = np.array(columns.kinds), columns.motors
-    motors = [column for column, *_ in entries]
+    motors = np.setdiff1d(entries, -1)
     inertial = columns.bodies[known[columns.bodies].any(axis=1)]
     lengths = np.linalg.norm(triangle[:, :-1], axis=0)
     typical = np.linalg.norm(triangle[:, -1]) / np.where(lengths > 0, lengths, np.inf)
@@ -106,15 +96,16 @@ def fit_consistent(
     to_theta, blocks = np.diag(np.where(kinds == "signed", typical, start)), []
     for places in inertial:
         J = pseudo_inertia(nearest_body(known[places]))
-        start[places], factor = np.asarray(body_of_pseudo_inertia(J)), np.linalg.cholesky(J)
-        directions = [np.asarray(body_of_pseudo_inertia(factor @ E @ factor.T)) for E in _BASIS]
-        to_theta[np.ix_(places, places)] = np.stack(directions, axis=1)
+        start[places], factor = body_of_pseudo_inertia(J), np.linalg.cholesky(J)
+        directions = [body_of_pseudo_inertia(factor @ E @ factor.T) for E in _BASIS]
+        to_theta[np.ix_(places, places)] = np.transpose(directions)
         blocks.append((places, _BASIS))
-    if entries:
-        if not np.linalg.eigvalsh(_armature(start, entries))[0] > 0:
+    if motors.size:
+        absent = entries < 0
+        if not np.linalg.eigvalsh(np.where(absent, 0.0, start[entries]))[0] > 0:
             start[kinds == "coupling"] = 0.0
-        back = np.linalg.inv(np.linalg.cholesky(_armature(start, entries)))
-        relative = np.stack([back @ _armature(unit, entries) @ back.T for unit in np.eye(len(kinds))[motors]])
+        back = np.linalg.inv(np.linalg.cholesky(np.where(absent, 0.0, start[entries])))
+        relative = back @ (entries == motors[:, None, None]) @ back.T
         sizes = np.linalg.norm(relative, axis=(1, 2))
         to_theta[motors, motors] = 1 / sizes
         blocks.append((motors, relative / sizes[:, None, None]))
@@ -130,7 +121,7 @@ class _Problem(NamedTuple):
 
     A: np.ndarray
     r: np.ndarray
-    blocks: list[tuple[Sequence[int] | np.ndarray, np.ndarray]]
+    blocks: list[tuple[np.ndarray, np.ndarray]]
     """Places in x, and basis [K, n, n], of every body and of the coupled motors."""
     z: np.ndarray
     """Places of z in the unknowns x, which hold it in place of exp(z) - 1."""

@@ -71,14 +71,16 @@ class Columns(NamedTuple):
         return np.flatnonzero(np.array(self.kinds) == "inertia").reshape(-1, 10)
 
     @property
-    def motors(self) -> list[tuple[int, int, int]]:
-        """(column, motor, motor) of every entry of the armature matrix of the coupled motors."""
-        entries: list[tuple[int, int, int]] = []
-        for column in np.flatnonzero(np.array(self.kinds) == "coupling").tolist():
-            first, second = self.names[column].removeprefix(COUPLING).split("_")
-            entries.append((column, int(first) - 1, int(second) - 1))
-        coupled = sorted({motor for _, *both in entries for motor in both})
-        return entries + [(self.names.index(f"{MOTORS}_{motor + 1}"), motor, motor) for motor in coupled]
+    def motors(self) -> Int[np.ndarray, "n n"]:
+        """Columns of the entries of the coupled motors' armature matrix; -1 for an entry that is zero."""
+        columns = {name: column for column, name in enumerate(self.names)}
+        coupled = [map(int, name.removeprefix(COUPLING).split("_")) for name in columns if name.startswith(COUPLING)]
+        motors = sorted({motor for pair in coupled for motor in pair})
+        entries = np.full((len(motors),) * 2, -1)
+        for i, j in np.ndindex(entries.shape):
+            low, high = sorted((motors[i], motors[j]))
+            entries[i, j] = columns.get(f"{MOTORS}_{low}" if i == j else f"{COUPLING}{low}_{high}", -1)
+        return entries
 
 
 def columns_of(parameters: Parameters) -> Columns:

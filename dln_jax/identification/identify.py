@@ -150,15 +150,11 @@ def parameters_of(theta: ParameterVector, like: Parameters) -> Parameters:
 
 def random_states(joints: tuple[JointKind, ...], samples: int, seed: int) -> Trajectories:
     """Random states: angles on the full circle, displacements up to 1 m, normal rates (sd 2), accelerations (sd 5)."""
-    d, random = len(joints), np.random.default_rng(seed)
+    shape, random = (samples, len(joints)), np.random.default_rng(seed)
     reach = np.where(np.array(joints) == "revolute", np.pi, 1.0)
-    arrays = {
-        "q": random.uniform(-reach, reach, (samples, d)),
-        "qd": 2 * random.normal(size=(samples, d)),
-        "qdd": 5 * random.normal(size=(samples, d)),
-        "tau": np.ones((samples, d)),
-    }
-    return from_arrays({**arrays, "t": np.zeros(samples), "trajectory": np.arange(samples)})
+    q, qd, qdd = random.uniform(-reach, reach, shape), 2 * random.normal(size=shape), 5 * random.normal(size=shape)
+    times = {"t": np.zeros(samples), "trajectory": np.arange(samples)}
+    return from_arrays({**times, "q": q, "qd": qd, "qdd": qdd, "tau": np.ones(shape)})
 
 
 def base_rows(result: Identification) -> list[dict[str, Any]]:

@@ -175,15 +175,14 @@ def choose_terms(
 
 def cross_validate(tree: Tree, data: Trajectories, terms: Terms) -> Float[np.ndarray, " segments"]:
     """Mean squared error of every segment, from fits to the folds without it."""
-    present = np.unique(data.trajectory)
-    folds = [np.isin(data.trajectory, present[fold::FOLDS]) for fold in range(FOLDS)]
-    fewest = min(int(np.sum(~held)) for held in folds)
+    fold_of = np.unique(data.trajectory, return_inverse=True)[1] % FOLDS
+    fewest = len(fold_of) - np.bincount(fold_of).max()
     with jax.enable_x64(True):
         known, design = known_of(tree, data, terms), functools.partial(equations, terms)
         evaluate = jax.jit(design)
         squares = np.zeros(len(data.t))
-        for held in folds:
-            rest = np.flatnonzero(~held)
+        for fold in range(FOLDS):
+            held, rest = fold_of == fold, np.flatnonzero(fold_of != fold)
             # The same number of samples in every fold, so that one compiled program serves all.
             rows = rest[np.linspace(0, len(rest) - 1, fewest).round().astype(int)]
             solution = solve_terms(terms, Known(*(part[rows] for part in known)), design)
@@ -213,22 +212,20 @@ def at_reference(
 
 def shared_motor(left: Float[np.ndarray, "N d"], qd: Float[np.ndarray, "N d"]) -> tuple[int, int, float, float] | None:
     """Returns j, i (from 0), c and the share of the motor that explains most; `None` if none explains enough."""
-    scale = left.std(axis=0)
+    from scipy.linalg import block_diag  # imported here, after commands have set BLAS's threads
+
+    scale, best = left.std(axis=0), None
     moving = np.flatnonzero((scale > 0) & (qd.std(axis=0) > 0))
-    own = {k: np.column_stack([_friction(qd[:, k]), np.ones(len(qd))]) for k in moving}
-    best = None
     for j, i in itertools.product(moving, moving):
         if i >= j:
             continue
-        before = np.concatenate([_unexplained(own[k], left[:, k] / scale[k]) for k in (j, i)])
+        own = [np.column_stack([_friction(qd[:, k]), np.ones(len(qd))]) for k in (j, i)]
+        alone, y = block_diag(*own), np.concatenate([left[:, k] / scale[k] for k in (j, i)])
+        before = _unexplained(alone, y)
         for c in RATIOS:
-            of_motor, zero = _friction(qd[:, j] + c * qd[:, i]), np.zeros_like(own[i])
-            A = np.block([
-                [own[j] / scale[j], zero, of_motor / scale[j]],
-                [zero, own[i] / scale[i], c * of_motor / scale[i]],
-            ])  # fmt: skip
-            y = np.concatenate([left[:, k] / scale[k] for k in (j, i)])
-            share = float(np.min(1 - _unexplained(A, y, 2) / before))
+            of_motor = _friction(qd[:, j] + c * qd[:, i])
+            on_both = np.concatenate([of_motor / scale[j], c * of_motor / scale[i]])
+            share = float(np.min(1 - _unexplained(np.hstack([alone, on_both]), y) / before))
             if share >= SHARE and (best is None or share > best[3]):
                 best = int(j), int(i), c, share
     return best
@@ -238,7 +235,7 @@ def _friction(rate: np.ndarray) -> np.ndarray:
     return np.column_stack([rate, np.tanh(rate / (SMOOTH * np.sqrt(np.mean(rate**2)) + 1e-300))])
 
 
-def _unexplained(A: np.ndarray, y: np.ndarray, joints: int = 1) -> np.ndarray:
-    """Mean square of what least squares leave of every joint."""
+def _unexplained(A: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Mean square of what least squares leave of both joints."""
     left = y - A @ np.linalg.lstsq(A, y, rcond=None)[0]
-    return np.mean(left.reshape(joints, -1) ** 2, axis=1) + 1e-300
+    return np.mean(left.reshape(2, -1) ** 2, axis=1) + 1e-300
