@@ -18,7 +18,7 @@ the ground come first. Within a body, mass, h_z and I_yy come last: these are th
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -88,20 +88,19 @@ def columns_of(parameters: Parameters) -> Columns:
     rows: list[tuple[str, Kind]] = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(parameters):
         name = jax.tree_util.keystr(path, simple=True, separator="_")
+        kind: Kind = "signed" if name.endswith(SIGNED) else "positive"
+        own = [f"{name}_{joint + 1}" for joint in range(np.size(leaf))]
         if name.startswith(COUPLING):
-            rows.append((name, "coupling"))
+            kind, own = "coupling", [name]
         elif name == BODIES and np.shape(leaf)[1:] == (len(PARAMETERS),):
-            rows += [(f"{own}_{joint + 1}", "inertia") for joint in range(len(leaf)) for own in PARAMETERS]
-        else:
-            kind: Kind = "signed" if name.endswith(SIGNED) else "positive"
-            rows += [(f"{name}_{joint + 1}", kind) for joint in range(np.size(leaf))]
+            kind, own = "inertia", [f"{which}_{joint + 1}" for joint in range(len(leaf)) for which in PARAMETERS]
+        rows.extend((column, kind) for column in own)
     return Columns(*zip(*rows, strict=True))
 
 
 def flat(parameters: Parameters) -> ParameterVector:
     """Concatenates all parameters in the order of the columns."""
-    leaves: list[Any] = [np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(parameters)]
-    return np.concatenate(leaves)
+    return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(parameters)]).astype(float)
 
 
 class Equations(NamedTuple):

@@ -45,7 +45,7 @@ from dln_jax.mechanics.trees.description import Tree, tree_to_json
 from dln_jax.mechanics.trees.motors import Pair
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.trees import Rows
-from dln_jax.types import Needs
+from dln_jax.types import FrictionLaw, Needs
 from dln_jax.zoo.descriptions import Description, build, describe
 
 MOST_SAMPLES, FEWER_SAMPLES = 4_000, 2_000
@@ -88,7 +88,7 @@ def describe_rigid_tree(
         InputError: as for `fit_friction`.
     """
     tree, stated = robot.tree, {} if velocity_scale is None else {"velocity_scale": velocity_scale}
-    laws = tuple(law for law in needs.joint_friction if law != "load")
+    laws: tuple[FrictionLaw, ...] = tuple(law for law in needs.joint_friction if law != "load")
     terms = Terms(laws, FrictionShape(**stated), tuple(stated), motors=motors)
     lines, additions = [], {}
     for pair in coupled:
@@ -216,16 +216,14 @@ def shared_motor(left: Float[np.ndarray, "N d"], qd: Float[np.ndarray, "N d"]) -
 
     scale, best = left.std(axis=0), None
     moving = np.flatnonzero((scale > 0) & (qd.std(axis=0) > 0))
-    for j, i in itertools.product(moving, moving):
-        if i >= j:
-            continue
+    for j, i in itertools.combinations(moving[::-1], 2):
         own = [np.column_stack([_friction(qd[:, k]), np.ones(len(qd))]) for k in (j, i)]
-        alone, y = block_diag(*own), np.concatenate([left[:, k] / scale[k] for k in (j, i)])
+        alone, y = np.asarray(block_diag(*own)), np.concatenate([left[:, k] / scale[k] for k in (j, i)])
         before = _unexplained(alone, y)
         for c in RATIOS:
             of_motor = _friction(qd[:, j] + c * qd[:, i])
             on_both = np.concatenate([of_motor / scale[j], c * of_motor / scale[i]])
-            share = float(np.min(1 - _unexplained(np.hstack([alone, on_both]), y) / before))
+            share = float(np.min(1 - _unexplained(np.column_stack([alone, on_both]), y) / before))
             if share >= SHARE and (best is None or share > best[3]):
                 best = int(j), int(i), c, share
     return best

@@ -25,13 +25,11 @@ from dln_jax.mechanics.friction import (
     FrictionShape,
     coefficients_of,
     joint_rates,
-    require_laws,
-    require_shape,
     shape_of,
     unit_force,
 )
 from dln_jax.mechanics.trees.description import Tree
-from dln_jax.mechanics.trees.motors import Pair, motor_regressor, require_motors
+from dln_jax.mechanics.trees.motors import Pair, motor_regressor
 from dln_jax.mechanics.trees.recursions import regressor
 from dln_jax.models.model import Model
 from dln_jax.models.trees import WARM, RigidTreeParameters, Rows, make_rigid_tree
@@ -113,28 +111,25 @@ def reference_temperature(data: Trajectories) -> float:
 def known_of(tree: Tree, data: Trajectories, terms: Terms, *, noise: Any = None) -> Known:
     """Returns the known quantities of a log, in float64; errors as for `fit_friction`."""
     d = tree.degrees_of_freedom
-    require_laws(terms.laws, "laws")
-    require_shape(terms.shape)
-    if terms.cooling and not set(coefficients_of(terms.laws)) & set(WARM):
-        laws = ", ".join(terms.laws) or "no law"
-        raise InputError(f"friction has {laws}, which no temperature changes; add viscous")
-    require_motors(terms.motors, terms.coupled, d)
+    bare, (laws, shape, _, cooling, motors, coupled) = tree._replace(armature=np.zeros(d)), terms
+    # A model refuses wrong terms.
+    make_rigid_tree(bare, friction=laws, cooling=float(cooling), motors=motors, coupled=coupled, **shape._asdict())
     weights = np.asarray(torque_scale(data) if noise is None else np.broadcast_to(noise, d), float)
     if not (np.isfinite(weights) & (weights > 0)).all():
         raise InputError(f"noise is {noise}; expected a positive number, or one for each joint")
 
     def columns(q: Any, qd: Any, qdd: Any) -> Any:
-        links = regressor(tree._replace(armature=np.zeros(d)), q, qd, qdd)[:, : 10 * d]
-        return jnp.concatenate([links, motor_regressor(terms.motors, terms.coupled, qdd)], axis=1)
+        links = regressor(bare, q, qd, qdd)[:, : 10 * d]
+        return jnp.concatenate([links, motor_regressor(motors, coupled, qdd)], axis=1)
 
     state, tau = arrays_of(data, ("q", "qd", "qdd")), jnp.asarray(data.tau)
     warmth = jnp.zeros_like(tau)
-    if terms.cooling:
+    if cooling:
         reference = reference_temperature(data)  # refuses data without temperature
         warmth = jnp.asarray(data.temperature) - reference
     return Known(
         links=jax.jit(jax.vmap(columns), compiler_options=quick_compilation())(*state),
-        rates=joint_rates(terms.motors, state[1].T).T,
+        rates=joint_rates(motors, state[1].T).T,
         warmth=warmth,
         tau=tau,
         weights=jnp.broadcast_to(weights, tau.shape),
@@ -163,7 +158,9 @@ def equations(terms: Terms, unknowns: Any, known: Known) -> tuple[Any, Any]:
 
 def _at_motors(terms: Terms, forces: Any) -> Any:
     """S⁻ᵀ of forces [N, d, P] at the joints."""
-    return forces if terms.motors is None else jnp.einsum("ji,njp->nip", np.linalg.inv(terms.motors), forces)
+    return (
+        forces if terms.motors is None else jnp.einsum("ji,njp->nip", np.linalg.inv(np.asarray(terms.motors)), forces)
+    )
 
 
 def _from_motors(terms: Terms, forces: Any) -> Any:
@@ -260,7 +257,7 @@ def fit_friction(
         both = jax.jvp(functools.partial(shapes_of, terms), (unknowns,), (jnp.ones_like(unknowns),))
         fitted, slopes = jax.tree.map(np.asarray, both)
     left = solution.residuals.reshape(-1, d) * np.asarray(known.weights)
-    shaped = shape._asdict() | {name: tuple(values.tolist()) for name, values in fitted.items()}
+    shaped: dict[str, Any] = shape._asdict() | {name: tuple(values.tolist()) for name, values in fitted.items()}
     if cooling:
         shaped["reference_temperature"] = reference_temperature(data)
     errors = np.sqrt(np.diagonal(solution.covariance))

@@ -107,7 +107,7 @@ def test_cross_validation_keeps_the_terms_of_the_plant_and_no_other(extra):
 def test_what_is_no_fit_is_refused():
     data = log_of("nothing")
     for laws, options, message in [
-        (("coulomb",), {"cooling": True}, "friction has coulomb, which no temperature changes; add viscous"),
+        (("coulomb",), {"cooling": True}, "cooling is 1.0, but friction has coulomb; add 'viscous' to it"),
         (("viscous",), {"cooling": True}, "friction is to depend on temperature, which the data do not have"),
         (("coulomb",), {"noise": 0.0}, "noise is 0.0; expected a positive number"),
     ]:

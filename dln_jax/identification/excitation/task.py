@@ -79,7 +79,7 @@ def harmonic_functions(harmonics: int, period: float, t: Any) -> tuple[Array, Ar
     sines, cosines = jnp.sin(phases), jnp.cos(phases)
     values = jnp.concatenate([sines, cosines], axis=1)
     slopes = jnp.concatenate([rates * cosines, -rates * sines], axis=1)
-    return values, slopes, -(np.concatenate([rates, rates]) ** 2) * values
+    return values, slopes, -(jnp.concatenate([rates, rates]) ** 2) * values
 
 
 def rest_basis(harmonics: int) -> Float[np.ndarray, "F K"]:
@@ -223,6 +223,7 @@ def independent_columns(A: Float[np.ndarray, "N P"]) -> Int[np.ndarray, " B"]:
     scaled, _ = scaled_columns(A, NEGLIGIBLE)
     if not scaled.any():
         return np.zeros(0, int)
-    triangle, order = qr(scaled, mode="r", pivoting=True)
+    factors: Any = qr(scaled, mode="r", pivoting=True)
+    triangle, order = factors
     remainders = np.abs(np.diagonal(triangle))
     return np.sort(order[: len(remainders)][remainders > DEPENDENT * remainders[0]])
