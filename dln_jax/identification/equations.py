@@ -222,18 +222,20 @@ def in_words(combination: ParameterVector, names: Sequence[str], first: int) -> 
     return text
 
 
-def determinacy(unseen: Float[np.ndarray, "K P"]) -> tuple[Determinacy, ...]:
+def determinacy(A: Float[np.ndarray, "N P"]) -> tuple[Determinacy, ...]:
     """Classifies every parameter as identifiable alone, in combination or not at all.
 
     Args:
-        unseen: orthonormal directions that change no force, for columns of unit length; zero columns have one each.
+        A: as for `null_directions`.
     """
-    shares = np.linalg.norm(unseen, axis=0)
+    shares = np.linalg.norm(null_directions(A), axis=0)
     return tuple("alone" if s < SHARE else "not at all" if s > 1 - SHARE else "in combination" for s in shares)
 
 
 def null_directions(A: Float[np.ndarray, "N P"]) -> Float[np.ndarray, "K P"]:
     """Orthonormal directions of the parameters that the equations do not determine, for columns scaled to unit length.
+
+    A column of zeros has a direction of its own.
 
     Args:
         A: Phi, or its triangular factor.

@@ -110,7 +110,7 @@ def identify(
     samples = max(STATES * d, -(-len(data.t) // -(-len(data.t) // equations.CHUNK)))
     general = compress(regressor_of(model, at, random_states(joints, samples, 0), free=free))
     A = np.concatenate(general.triangles)[:, :-1]
-    structure = equations.determinacy(equations.null_directions(A))
+    structure = equations.determinacy(A)
     base = equations.base_parameters(A, columns)
     if robust:
         rough, weights = fit_robust(regressor, theta)

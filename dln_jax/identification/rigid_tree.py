@@ -26,7 +26,7 @@ from dln_jax.compilation import quick_compilation
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import BLOCKS, every, in_blocks
-from dln_jax.identification.equations import determinacy, null_directions
+from dln_jax.identification.equations import determinacy
 from dln_jax.identification.identify import STATES, random_states
 from dln_jax.learning.friction import (
     FrictionFit,
@@ -132,7 +132,7 @@ def is_identifiable(tree: Tree, motors: Rows | None, pair: Pair) -> bool:
     states = random_states(tree.joints, STATES * tree.degrees_of_freedom, 0)
     with jax.enable_x64(True):
         links = known_of(tree, states, Terms((), motors=motors, coupled=(pair,)), noise=1.0).links
-    return determinacy(null_directions(np.asarray(links).reshape(-1, links.shape[2])))[-1] == "alone"
+    return determinacy(np.asarray(links).reshape(-1, links.shape[2]))[-1] == "alone"
 
 
 class TriedTerm(NamedTuple):

@@ -74,7 +74,7 @@ def test_base_parameters_are_those_of_the_textbook():
     np.testing.assert_allclose(A[:, list(base.independent)] @ base.combinations, A, atol=1e-9 * abs(A).max())
     directions = null_directions(A)
     assert len(directions) == len(COLUMNS.names) - 13
-    kinds = dict(zip(COLUMNS.names, determinacy(directions), strict=True))
+    kinds = dict(zip(COLUMNS.names, determinacy(A), strict=True))
     together = {name for name, kind in kinds.items() if kind == "in combination"}
     assert together == {"h_x_1", "I_zz_1", "m_2", "armature_1"}
     assert kinds["m_1"] == kinds["I_xx_2"] == kinds["h_z_2"] == "not at all"
