@@ -110,49 +110,54 @@ def fit_consistent(
         to_theta[motors, motors] = 1 / sizes
         blocks.append((motors, relative / sizes[:, None, None]))
     z = np.setdiff1d(np.flatnonzero(kinds == "positive"), motors)
-    problem = _Problem(triangle[:, :-1] @ to_theta, triangle[:, :-1] @ start - triangle[:, -1], blocks, z)
-    x, done, converged = _minimum(problem, regularisation, iterations)
-    divergences = _divergences(problem.blocks_of(x)[: len(inertial)])
-    return ConsistentFit(start + to_theta @ problem.directions(x), divergences, done, converged)
+    A, r = triangle[:, :-1] @ to_theta, triangle[:, :-1] @ start - triangle[:, -1]
+    y, matrices, done, converged = _minimum(A, r, blocks, z, regularisation, iterations)
+    return ConsistentFit(start + to_theta @ y, _divergences(matrices[: len(inertial)]), done, converged)
 
 
-class _Problem(NamedTuple):
-    """Residuals A y + r with y = (M - 1 of every block in its basis, exp(z) - 1, signed parameters)."""
+def _minimum(
+    A: np.ndarray,
+    r: np.ndarray,
+    blocks: list[tuple[np.ndarray, np.ndarray]],
+    logarithmic: np.ndarray,
+    regularisation: float,
+    iterations: int,
+) -> tuple[np.ndarray, list[np.ndarray], int, bool]:
+    """Minimises F with the residuals A y + r, y = (M - 1 of every block in its basis, exp(z) - 1, signed parameters).
 
-    A: np.ndarray
-    r: np.ndarray
-    blocks: list[tuple[np.ndarray, np.ndarray]]
-    """Places in x, and basis [K, n, n], of every body and of the coupled motors."""
-    z: np.ndarray
-    """Places of z in the unknowns x, which hold it in place of exp(z) - 1."""
+    Args:
+        blocks: places in the unknowns, and basis [K, n, n], of every body and of the coupled motors.
+        logarithmic: places of z in the unknowns x, which hold it in place of exp(z) - 1.
 
-    def blocks_of(self, x: np.ndarray) -> list[np.ndarray]:
-        """M [n, n] of every block."""
-        return [np.eye(basis.shape[1]) + np.tensordot(x[own], basis, 1) for own, basis in self.blocks]
+    Returns:
+        y, M [n, n] of every block, the number of iterations, and whether they converged.
+    """
 
-    def directions(self, x: np.ndarray) -> np.ndarray:
-        """y as a function of the unknowns."""
+    def matrices(x: np.ndarray) -> list[np.ndarray]:
+        return [np.eye(basis.shape[1]) + np.tensordot(x[own], basis, 1) for own, basis in blocks]
+
+    def directions(x: np.ndarray) -> np.ndarray:
         y = x.copy()
-        y[self.z] = np.expm1(x[self.z])
+        y[logarithmic] = np.expm1(x[logarithmic])
         return y
 
-    def value(self, x: np.ndarray, weight: float) -> float:
+    def value(x: np.ndarray, weight: float) -> float:
         """F; infinite where a body is not physically consistent or z exceeds 100."""
-        M, z = self.blocks_of(x), x[self.z]
+        M, z = matrices(x), x[logarithmic]
         if any(np.linalg.eigvalsh(block)[0] <= 0 for block in M) or z.max(initial=0.0) > 100:
             return np.inf
-        errors = self.A @ self.directions(x) + self.r
+        errors = A @ directions(x) + r
         return float(errors @ errors + weight * (_divergences(M).sum() + 0.5 * z @ z))
 
-    def newton(self, x: np.ndarray, weight: float) -> tuple[np.ndarray, float]:
+    def newton(x: np.ndarray, weight: float) -> tuple[np.ndarray, float]:
         """The Newton step, solved as a least-squares problem for numerical stability, and its decrement."""
-        z, errors = x[self.z], self.A @ self.directions(x) + self.r
-        slopes = self.A.copy()
-        slopes[:, self.z] *= np.exp(z)
+        z, errors = x[logarithmic], A @ directions(x) + r
+        slopes = A.copy()
+        slopes[:, logarithmic] *= np.exp(z)
         # The curvature of exp(z) enters only where it is positive, so that the step remains a descent direction.
-        bend = np.sqrt(weight / 2 + np.maximum(slopes[:, self.z].T @ errors, 0.0))
-        rows, right = [slopes, bend[:, None] * np.eye(len(x))[self.z]], [-errors, -weight / 2 * z / bend]
-        for (own, basis), M in zip(self.blocks, self.blocks_of(x), strict=True):
+        bend = np.sqrt(weight / 2 + np.maximum(slopes[:, logarithmic].T @ errors, 0.0))
+        rows, right = [slopes, bend[:, None] * np.eye(len(x))[logarithmic]], [-errors, -weight / 2 * z / bend]
+        for (own, basis), M in zip(blocks, matrices(x), strict=True):
             C, block = np.linalg.cholesky(M), np.zeros((M.size, len(x)))
             inner = np.linalg.solve(C, np.linalg.solve(C, basis).transpose(0, 2, 1))
             block[:, own] = inner.reshape(len(basis), M.size).T
@@ -162,27 +167,23 @@ class _Problem(NamedTuple):
         step = np.linalg.lstsq(system, np.concatenate(right), rcond=None)[0]
         return step, float(np.sum((system @ step) ** 2))
 
-
-def _minimum(problem: _Problem, regularisation: float, iterations: int) -> tuple[np.ndarray, int, bool]:
-    """The unknowns that minimise F, the number of iterations, and whether they converged."""
-    x = np.zeros(problem.A.shape[1])
-    weight = max(regularisation, problem.value(x, 0.0) / len(x))
+    x = np.zeros(A.shape[1])
+    weight = max(regularisation, value(x, 0.0) / len(x))
     for done in range(iterations):
-        step, decrement = problem.newton(x, weight)
-        now, last = problem.value(x, weight), weight == regularisation
+        step, decrement = newton(x, weight)
+        now, last, length = value(x, weight), weight == regularisation, 1.0
         if last and decrement <= TOLERANCE * (1 + now):
-            return x, done, True
-        length = 1.0
+            return directions(x), matrices(x), done, True
         # Armijo's condition; F is infinite for inconsistent bodies, so a step never leaves the feasible set.
-        while problem.value(x + length * step, weight) > now - 1e-4 * length * decrement:
+        while value(x + length * step, weight) > now - 1e-4 * length * decrement:
             length /= 2
             if length < 1e-12:
                 # Rounding hides any further decrease; this counts as converged if the decrement is small enough.
-                return x, done, last and decrement <= 1e-8 * (1 + now)
+                return directions(x), matrices(x), done, last and decrement <= 1e-8 * (1 + now)
         x = x + length * step
         if not last and decrement <= CENTRED * weight:
             weight = max(regularisation, weight / FALL)
-    return x, iterations, False
+    return directions(x), matrices(x), iterations, False
 
 
 def _divergences(blocks: list[np.ndarray]) -> np.ndarray:

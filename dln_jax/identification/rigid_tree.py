@@ -110,9 +110,7 @@ def describe_rigid_tree(
     fitted, keywords = None, {"motors": motors, "coupled": terms.coupled, **stated}
     if terms.learned:
         fitted = fit_friction(tree, every(train, -(-len(train.t) // MOST_SAMPLES)), **terms._asdict())
-        keywords |= {name: values.tolist() for name, values in fitted.shape.items()}
-        if fitted.reference_temperature is not None:
-            keywords["reference_temperature"] = fitted.reference_temperature
+        keywords = fitted.keywords
     needs = needs._replace(joint_friction=terms.laws)
     return describe("rigid-tree", precision="f64", needs=needs, tree=tree_to_json(tree), **keywords), fitted, lines
 

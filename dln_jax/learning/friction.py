@@ -216,8 +216,9 @@ class FrictionFit(NamedTuple):
     """Fitted entries of `FrictionShape`, "load", and "cooling" (k, 1/K)."""
     shape_errors: dict[str, Float[np.ndarray, " d"]]
     """Standard errors of the entries of `shape`, in their units."""
-    reference_temperature: float | None
-    """Reference temperature of viscous friction, °C; `None` if friction does not depend on temperature."""
+    keywords: dict[str, Any]
+    """Keywords of `make_rigid_tree` for the model, without its laws: shapes, motors, and with cooling the reference
+    temperature of viscous friction, °C."""
     torque_mse: float
     """Mean over samples of the sum of squared errors over joints; (N m)² or N²."""
     solution: SeparableSolution
@@ -257,19 +258,20 @@ def fit_friction(
         both = jax.jvp(functools.partial(shapes_of, terms), (unknowns,), (jnp.ones_like(unknowns),))
         fitted, slopes = jax.tree.map(np.asarray, both)
     left = solution.residuals.reshape(-1, d) * np.asarray(known.weights)
-    shaped: dict[str, Any] = shape._asdict() | {name: tuple(values.tolist()) for name, values in fitted.items()}
+    keywords: dict[str, Any] = {"motors": motors, "coupled": coupled, **shape._asdict()}
+    keywords |= {name: tuple(values.tolist()) for name, values in fitted.items()}
     if cooling:
-        shaped["reference_temperature"] = reference_temperature(data)
+        keywords["reference_temperature"] = reference_temperature(data)
     errors = np.sqrt(np.diagonal(solution.covariance))
     of_linear, of_shapes = np.split(errors[: solution.linear.size + d * len(terms.learned)], [solution.linear.size])
     by_shape = zip(terms.learned, of_shapes.reshape(-1, d), strict=True)
     return FrictionFit(
-        model=make_rigid_tree(tree, friction=laws, motors=motors, coupled=coupled, **shaped),
+        model=make_rigid_tree(tree, friction=laws, **keywords),
         parameters=_parameters(solution.linear, terms, d),
         standard_errors=_parameters(of_linear, terms, d),
         shape=fitted,
         shape_errors={name: slopes[name] * deviation for name, deviation in by_shape},
-        reference_temperature=shaped.get("reference_temperature"),
+        keywords=keywords,
         torque_mse=float(np.mean(np.sum(left**2, axis=1))),
         solution=solution,
     )

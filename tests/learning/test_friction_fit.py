@@ -90,7 +90,7 @@ def test_cooling_and_coupling_are_found_within_their_errors():
     off = (fit.shape["cooling"] - np.array([0.02, 0.01])) / fit.shape_errors["cooling"]
     assert np.abs(off).max() < 3.5 and (fit.shape_errors["cooling"] < 2e-3).all()
     # The viscous coefficients are those at the reference, the log's mean temperature.
-    factor = np.exp(-np.array([0.02, 0.01]) * (fit.reference_temperature - 25))
+    factor = np.exp(-np.array([0.02, 0.01]) * (fit.keywords["reference_temperature"] - 25))
     off = (np.asarray(fit.parameters.viscous) - factor * [0.4, 0.3]) / np.asarray(fit.standard_errors.viscous)
     assert np.abs(off).max() < 3.5
     fit = fit_friction(ARM, log_of("coupled"), LAWS, coupled=((0, 1),), noise=NOISE)
