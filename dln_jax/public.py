@@ -12,7 +12,7 @@ from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.engine.problem import Problem
 from dln_jax.mechanics.dynamics import InverseForward, PhaseRates
 from dln_jax.mechanics.equations import dynamics, flow
-from dln_jax.mechanics.friction.curves import joint_dissipation
+from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalHamiltonian, NaturalSystem

@@ -79,9 +79,8 @@ def main(options: Arguments) -> None:
         random_designs,
         together,
     )
-    from dln_jax.identification.excitation.fourier import require_sampling
     from dln_jax.identification.excitation.limits import heights_above, limits_of_robot, scale_limits
-    from dln_jax.identification.excitation.task import make_task
+    from dln_jax.identification.excitation.task import make_task, require_sampling
     from dln_jax.mechanics.trees.description import with_payload
     from dln_jax.mechanics.trees.inertia import inertial_parameters
     from dln_jax.models.trees import make_rigid_tree

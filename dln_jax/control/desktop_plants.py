@@ -24,7 +24,7 @@ from dln_jax.control.state_space import field_of
 from dln_jax.control.swing_up import SwingUp, SwingUpNumbers, Upright, swing_up, upright_of
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction.laws import FrictionCoefficients, FrictionShape
+from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape
 from dln_jax.scenes.pendulums import cart_pole, rotary_pendulum
 from dln_jax.scenes.scene import Scene, with_friction
 from dln_jax.types import InputError

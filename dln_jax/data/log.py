@@ -14,7 +14,7 @@ from dln_jax.data.encoders.smoothing import Smoothed, smooth
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import with_joints
-from dln_jax.mechanics.friction.laws import USUAL
+from dln_jax.mechanics.friction import USUAL
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.types import InputError, Needs
 

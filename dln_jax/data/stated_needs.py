@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from dln_jax.files import matches
-from dln_jax.mechanics.friction.laws import require_laws
+from dln_jax.mechanics.friction import require_laws
 from dln_jax.types import InputError, Needs, require_once
 
 

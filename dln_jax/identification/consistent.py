@@ -13,12 +13,13 @@ method with a regularisation that falls to the requested value. The data enter a
 takes on the order of P³ operations, independent of the number of samples N.
 """
 
+from itertools import combinations_with_replacement
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.identification.equations import Columns
+from dln_jax.identification.equations import Columns, ParameterVector
 from dln_jax.mechanics.trees.inertia import body_of_pseudo_inertia, pseudo_inertia
 from dln_jax.types import InputError, require_positive
 
@@ -35,18 +36,15 @@ CENTRED = 0.1
 """An intermediate minimum counts as reached at this Newton decrement, in units of the regularisation."""
 TOLERANCE = 1e-10
 """The search stops at this Newton decrement (expected decrease of F in another iteration), relative to 1 + F."""
-_ABOVE = np.triu_indices(4, 1)
-_BASIS = np.array(
-    [np.outer(row, row) for row in np.eye(4)]
-    + [(np.outer(a, b) + np.outer(b, a)) / np.sqrt(2) for a, b in zip(*np.eye(4)[np.array(_ABOVE)], strict=True)]
-)
+_SYMMETRIC = np.array([np.outer(a, b) + np.outer(b, a) for a, b in combinations_with_replacement(np.eye(4), 2)])
+_BASIS = _SYMMETRIC / np.linalg.norm(_SYMMETRIC, axis=(1, 2), keepdims=True)
 """Orthonormal basis of the symmetric matrices [10, 4, 4]."""
 
 
 class ConsistentFit(NamedTuple):
     """Physically consistent parameters and how the solver ended."""
 
-    theta: Float[np.ndarray, " P"]
+    theta: ParameterVector
     divergence: Float[np.ndarray, " bodies"]
     """D(J | J_0) of every body with inertia."""
     iterations: int
@@ -55,35 +53,22 @@ class ConsistentFit(NamedTuple):
     """Whether the Newton decrement fell below the tolerance; otherwise the iterations or the line search ran out."""
 
 
-def _armature(theta: np.ndarray, entries: list[tuple[int, int, int]]) -> np.ndarray:
-    """Armature matrix of coupled motors, without the others."""
-    motors = sorted({motor for _, motor, _ in entries})
-    A = np.zeros((len(motors), len(motors)))
-    for column, i, j in entries:
-        A[motors.index(i), motors.index(j)] = A[motors.index(j), motors.index(i)] = theta[column]
-    return A
-
-
-def is_consistent(theta: Float[np.ndarray, " P"], columns: Columns) -> tuple[bool, ...]:
-    """Whether the pseudo-inertia of every body is positive definite; a body with ten zeros counts as consistent."""
-    bodies = theta[columns.bodies]
-    return tuple(bool(not body.any() or np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0) for body in bodies)
-
-
 def nearest_body(theta: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
     """Raises the eigenvalues of a pseudo-inertia to `SMALLEST` times the largest; `InputError` if none is positive."""
-    values, vectors = np.linalg.eigh(pseudo_inertia(np.asarray(theta, float)))
-    if not values[-1] > 0:
+    theta = np.asarray(theta, float)
+    values, vectors = np.linalg.eigh(pseudo_inertia(theta))
+    least = SMALLEST * values[-1]
+    if not least > 0:
         raise InputError("a link that is to be identified has no mass; expected a rough value for it")
-    if values[0] >= SMALLEST * values[-1]:
-        return np.asarray(theta, float)
-    return np.asarray(body_of_pseudo_inertia((vectors * np.maximum(values, SMALLEST * values[-1])) @ vectors.T))
+    if values[0] >= least:
+        return theta
+    return np.asarray(body_of_pseudo_inertia((vectors * np.maximum(values, least)) @ vectors.T))
 
 
 def fit_consistent(
     triangle: Float[np.ndarray, "K P_and_1"],
     columns: Columns,
-    known: Float[np.ndarray, " P"],
+    known: ParameterVector,
     *,
     regularisation: float = REGULARISATION,
     iterations: int = 500,
@@ -101,118 +86,104 @@ def fit_consistent(
         InputError: `regularisation` is not positive, or a body has no mass.
     """
     require_positive(regularisation=regularisation)
-    kinds, identity = np.array(columns.kinds), np.eye(len(columns.kinds))
+    kinds, entries = np.array(columns.kinds), columns.motors
+    motors = np.setdiff1d(entries, -1)
     inertial = columns.bodies[known[columns.bodies].any(axis=1)]
-    positive, signed = (np.flatnonzero(kinds == kind) for kind in ("positive", "signed"))
     lengths = np.linalg.norm(triangle[:, :-1], axis=0)
     typical = np.linalg.norm(triangle[:, -1]) / np.where(lengths > 0, lengths, np.inf)
     typical = np.where(typical > 0, typical, 1.0)
-    start = np.zeros(len(kinds))
-    start[positive] = np.where(known[positive] > 0, known[positive], UNKNOWN_SHARE * typical[positive])
-    start[signed] = known[signed]
-    # Columns of the map to theta: those of every block, then the positive coefficients, then the signed ones.
-    maps, bases = [], []
+    start = np.where((kinds == "positive") & ~(known > 0), UNKNOWN_SHARE * typical, known)
+    to_theta, blocks = np.diag(np.where(kinds == "signed", typical, start)), []
     for places in inertial:
         J = pseudo_inertia(nearest_body(known[places]))
-        start[places], factor = np.asarray(body_of_pseudo_inertia(J)), np.linalg.cholesky(J)
-        directions = [np.asarray(body_of_pseudo_inertia(factor @ E @ factor.T)) for E in _BASIS]
-        maps.append(identity[:, places] @ np.stack(directions, axis=1))
-        bases.append(_BASIS)
-    if entries := columns.motors:
-        places = [column for column, *_ in entries]
-        start[places] = [start[column] if i == j else known[column] for column, i, j in entries]
-        if not np.linalg.eigvalsh(_armature(start, entries))[0] > 0:
-            start[places] = [start[column] if i == j else 0.0 for column, i, j in entries]
-        factor = np.linalg.cholesky(_armature(start, entries))
-        back = np.linalg.inv(factor)
-        units = [_armature(identity[column], entries) for column in places]
-        relative = np.stack([back @ unit @ back.T for unit in units])
-        lengths_of = np.linalg.norm(relative, axis=(1, 2))
-        maps.append(identity[:, places] / lengths_of)
-        bases.append(relative / lengths_of[:, None, None])
-    positive = np.setdiff1d(positive, [column for column, *_ in columns.motors])
-    to_theta = np.hstack([*maps, identity[:, positive] * start[positive], identity[:, signed] * typical[signed]])
+        start[places], factor = body_of_pseudo_inertia(J), np.linalg.cholesky(J)
+        directions = [body_of_pseudo_inertia(factor @ E @ factor.T) for E in _BASIS]
+        to_theta[np.ix_(places, places)] = np.transpose(directions)
+        blocks.append((places, _BASIS))
+    if motors.size:
+        absent = entries < 0
+        if not np.linalg.eigvalsh(np.where(absent, 0.0, start[entries]))[0] > 0:
+            start[kinds == "coupling"] = 0.0
+        back = np.linalg.inv(np.linalg.cholesky(np.where(absent, 0.0, start[entries])))
+        relative = back @ (entries == motors[:, None, None]) @ back.T
+        sizes = np.linalg.norm(relative, axis=(1, 2))
+        to_theta[motors, motors] = 1 / sizes
+        blocks.append((motors, relative / sizes[:, None, None]))
+    z = np.setdiff1d(np.flatnonzero(kinds == "positive"), motors)
     A, r = triangle[:, :-1] @ to_theta, triangle[:, :-1] @ start - triangle[:, -1]
-    blocks, first = [], 0
-    for basis in bases:
-        blocks.append((slice(first, first + len(basis)), basis))
-        first += len(basis)
-    problem = _Problem(A, r, tuple(blocks), slice(first, first + len(positive)))
-    x, done, converged = _minimum(problem, regularisation, iterations)
-    divergences = _divergences(problem.blocks_of(x)[: len(inertial)])
-    return ConsistentFit(start + to_theta @ problem.directions(x), divergences, done, converged)
+    y, matrices, done, converged = _minimum(A, r, blocks, z, regularisation, iterations)
+    return ConsistentFit(start + to_theta @ y, _divergences(matrices[: len(inertial)]), done, converged)
 
 
-class _Problem(NamedTuple):
-    """Residuals A y + r with y = (M - 1 of every block in its basis, exp(z) - 1, signed parameters)."""
+def _minimum(
+    A: np.ndarray,
+    r: np.ndarray,
+    blocks: list[tuple[np.ndarray, np.ndarray]],
+    logarithmic: np.ndarray,
+    regularisation: float,
+    iterations: int,
+) -> tuple[np.ndarray, list[np.ndarray], int, bool]:
+    """Minimises F with the residuals A y + r, y = (M - 1 of every block in its basis, exp(z) - 1, signed parameters).
 
-    A: np.ndarray
-    r: np.ndarray
-    blocks: tuple[tuple[slice, np.ndarray], ...]
-    """Places in x, and basis [K, n, n], of every body and of the coupled motors."""
-    z: slice
-    """Places of z in the unknowns x, which hold it in place of exp(z) - 1."""
+    Args:
+        blocks: places in the unknowns, and basis [K, n, n], of every body and of the coupled motors.
+        logarithmic: places of z in the unknowns x, which hold it in place of exp(z) - 1.
 
-    def blocks_of(self, x: np.ndarray) -> list[np.ndarray]:
-        """M [n, n] of every block."""
-        return [np.eye(basis.shape[1]) + np.tensordot(x[own], basis, 1) for own, basis in self.blocks]
+    Returns:
+        y, M [n, n] of every block, the number of iterations, and whether they converged.
+    """
 
-    def directions(self, x: np.ndarray) -> np.ndarray:
-        """y as a function of the unknowns."""
+    def matrices(x: np.ndarray) -> list[np.ndarray]:
+        return [np.eye(basis.shape[1]) + np.tensordot(x[own], basis, 1) for own, basis in blocks]
+
+    def directions(x: np.ndarray) -> np.ndarray:
         y = x.copy()
-        y[self.z] = np.expm1(x[self.z])
+        y[logarithmic] = np.expm1(x[logarithmic])
         return y
 
-    def value(self, x: np.ndarray, weight: float) -> float:
+    def value(x: np.ndarray, weight: float) -> float:
         """F; infinite where a body is not physically consistent or z exceeds 100."""
-        M, z = self.blocks_of(x), x[self.z]
+        M, z = matrices(x), x[logarithmic]
         if any(np.linalg.eigvalsh(block)[0] <= 0 for block in M) or z.max(initial=0.0) > 100:
             return np.inf
-        errors = self.A @ self.directions(x) + self.r
+        errors = A @ directions(x) + r
         return float(errors @ errors + weight * (_divergences(M).sum() + 0.5 * z @ z))
 
-    def newton(self, x: np.ndarray, weight: float) -> tuple[np.ndarray, float]:
+    def newton(x: np.ndarray, weight: float) -> tuple[np.ndarray, float]:
         """The Newton step, solved as a least-squares problem for numerical stability, and its decrement."""
-        z, errors = x[self.z], self.A @ self.directions(x) + self.r
-        slopes = self.A.copy()
-        slopes[:, self.z] *= np.exp(z)
-        rows, right = [slopes], [-errors]
-        for (own, basis), M in zip(self.blocks, self.blocks_of(x), strict=True):
-            C = np.linalg.cholesky(M)
+        z, errors = x[logarithmic], A @ directions(x) + r
+        slopes = A.copy()
+        slopes[:, logarithmic] *= np.exp(z)
+        # The curvature of exp(z) enters only where it is positive, so that the step remains a descent direction.
+        bend = np.sqrt(weight / 2 + np.maximum(slopes[:, logarithmic].T @ errors, 0.0))
+        rows, right = [slopes, bend[:, None] * np.eye(len(x))[logarithmic]], [-errors, -weight / 2 * z / bend]
+        for (own, basis), M in zip(blocks, matrices(x), strict=True):
+            C, block = np.linalg.cholesky(M), np.zeros((M.size, len(x)))
             inner = np.linalg.solve(C, np.linalg.solve(C, basis).transpose(0, 2, 1))
-            block = np.zeros((M.size, len(x)))
             block[:, own] = inner.reshape(len(basis), M.size).T
             rows.append(np.sqrt(weight / 2) * block)
             right.append(-np.sqrt(weight / 2) * (C.T @ C - np.eye(len(M))).ravel())
-        # The curvature of exp(z) enters only where it is positive, so that the step remains a descent direction.
-        bend = np.sqrt(weight / 2 + np.maximum(slopes[:, self.z].T @ errors, 0.0))
-        rows.append(bend[:, None] * np.eye(len(x))[self.z])
-        right.append(-weight / 2 * z / bend)
         system = np.concatenate(rows)
         step = np.linalg.lstsq(system, np.concatenate(right), rcond=None)[0]
         return step, float(np.sum((system @ step) ** 2))
 
-
-def _minimum(problem: _Problem, regularisation: float, iterations: int) -> tuple[np.ndarray, int, bool]:
-    """The unknowns that minimise F, the number of iterations, and whether they converged."""
-    x = np.zeros(problem.A.shape[1])
-    weight = max(regularisation, problem.value(x, 0.0) / max(1, len(x)))
+    x = np.zeros(A.shape[1])
+    weight = max(regularisation, value(x, 0.0) / len(x))
     for done in range(iterations):
-        step, decrement = problem.newton(x, weight)
-        now, last = problem.value(x, weight), weight == regularisation
+        step, decrement = newton(x, weight)
+        now, last, length = value(x, weight), weight == regularisation, 1.0
         if last and decrement <= TOLERANCE * (1 + now):
-            return x, done, True
-        length = 1.0
+            return directions(x), matrices(x), done, True
         # Armijo's condition; F is infinite for inconsistent bodies, so a step never leaves the feasible set.
-        while problem.value(x + length * step, weight) > now - 1e-4 * length * decrement:
+        while value(x + length * step, weight) > now - 1e-4 * length * decrement:
             length /= 2
             if length < 1e-12:
                 # Rounding hides any further decrease; this counts as converged if the decrement is small enough.
-                return x, done, last and decrement <= 1e-8 * (1 + now)
+                return directions(x), matrices(x), done, last and decrement <= 1e-8 * (1 + now)
         x = x + length * step
         if not last and decrement <= CENTRED * weight:
             weight = max(regularisation, weight / FALL)
-    return x, iterations, False
+    return directions(x), matrices(x), iterations, False
 
 
 def _divergences(blocks: list[np.ndarray]) -> np.ndarray:

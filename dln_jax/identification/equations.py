@@ -1,4 +1,4 @@
-"""Least-squares equations of a model linear in its parameters, and the names of their columns.
+"""Least-squares equations of a model linear in its parameters, the names of their columns, and base parameters.
 
 The equations are compressed to one triangular factor per joint:
 
@@ -9,10 +9,16 @@ Reweighting joints, fixing parameters and changing unknowns then act on the [P +
 The columns follow from the model's parameters. The leaf `inertias` [links, 10] holds the inertial parameters of the
 bodies, the leaves of `coupling` one entry of the motors' armature matrix each; every other leaf has one entry per joint
 and gives its name to its columns. A new friction law therefore needs no change here.
+
+Base parameters say which parameters are identifiable alone, which only in combination, and which not at all. Forces
+depend on P parameters through fewer combinations, the base parameters (Gautier and Khalil 1990; numerically
+Gautier 1991). The columns are visited in an order of preference. A column that is linearly independent of those before
+it is kept, in Phi_1; the others are Phi_2 = Phi_1 K, so that Phi theta = Phi_1 (theta_1 + K theta_2). Bodies nearer to
+the ground come first. Within a body, mass, h_z and I_yy come last: these are the parameters usually regrouped.
 """
 
-from collections.abc import Callable, Iterator
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -22,10 +28,25 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.learning.linear import design, design_chunks, require_linear, unravelled
 from dln_jax.mechanics.trees.inertia import PARAMETERS
 from dln_jax.models.model import Model, Parameters
-from dln_jax.solvers.least_squares import triangular_factor
+from dln_jax.solvers.least_squares import scaled_columns
 from dln_jax.types import InputError
 
+ParameterVector = Float[np.ndarray, " P"]
+JointVector = Float[np.ndarray, " d"]
 Kind = Literal["inertia", "positive", "signed", "coupling"]
+Determinacy = Literal["alone", "in combination", "not at all"]
+PREFERRED = ("I_zz", "h_x", "h_y", "I_xx", "I_xy", "I_xz", "I_yz", "I_yy", "h_z", "m")
+"""The ten parameters of a body, in their stored order."""
+DEPENDENT = 1e-8
+"""Columns whose residual after projection on the others is shorter than this fraction of their length count as linearly
+dependent; so do singular values below this fraction of the largest. For random states this lies well between rounding
+errors and true residuals."""
+NEGLIGIBLE = 1e-12
+"""Columns shorter than this fraction of the longest are zero up to rounding: their terms cancel."""
+SHARE = 1e-6
+"""A parameter counts as identifiable alone if its share in the undetermined directions is below this number."""
+SHOWN = 1e-7
+"""Coefficients below this fraction of the largest in their combination are rounding errors and set to zero."""
 BODIES, MOTORS, COUPLING = "inertias", "armature", "coupling_"
 """Names of the leaves with the inertial parameters, ten columns per body, and with the motors' inertias; start of the
 names of columns off the diagonal of the armature, such as "coupling_2_3"."""
@@ -43,8 +64,6 @@ class Columns(NamedTuple):
     kinds: tuple[Kind, ...]
     """"inertia" for the ten columns of a body, "positive" for armature and friction, "signed" for either sign,
     "coupling" for the armature between two motors."""
-    joints: tuple[int, ...]
-    """Joint of every column, counted from 0, the second one of a coupling."""
 
     @property
     def bodies(self) -> Int[np.ndarray, "bodies 10"]:
@@ -52,41 +71,36 @@ class Columns(NamedTuple):
         return np.flatnonzero(np.array(self.kinds) == "inertia").reshape(-1, 10)
 
     @property
-    def motors(self) -> list[tuple[int, int, int]]:
-        """(column, motor, motor) of every entry of the armature matrix of the coupled motors."""
-        entries: list[tuple[int, int, int]] = []
-        for column in np.flatnonzero(np.array(self.kinds) == "coupling").tolist():
-            first, second = self.names[column].removeprefix(COUPLING).split("_")
-            entries.append((column, int(first) - 1, int(second) - 1))
-        coupled = sorted({motor for _, *both in entries for motor in both})
-        return entries + [(self.names.index(f"{MOTORS}_{motor + 1}"), motor, motor) for motor in coupled]
+    def motors(self) -> Int[np.ndarray, "n n"]:
+        """Columns of the entries of the coupled motors' armature matrix; -1 for an entry that is zero."""
+        columns = {name: column for column, name in enumerate(self.names)}
+        coupled = [map(int, name.removeprefix(COUPLING).split("_")) for name in columns if name.startswith(COUPLING)]
+        motors = sorted({motor for pair in coupled for motor in pair})
+        entries = np.full((len(motors),) * 2, -1)
+        for i, j in np.ndindex(entries.shape):
+            low, high = sorted((motors[i], motors[j]))
+            entries[i, j] = columns.get(f"{MOTORS}_{low}" if i == j else f"{COUPLING}{low}_{high}", -1)
+        return entries
 
 
 def columns_of(parameters: Parameters) -> Columns:
     """Columns of a model with these parameters; outside `inertias` a column is named by its leaf and place in it."""
-    names: list[str] = []
-    kinds: list[Kind] = []
-    joints: list[int] = []
-    for path, leaf in jax.tree_util.tree_flatten_with_path(parameters)[0]:
-        name = "_".join(str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path)
-        shape = np.shape(leaf)
-        bodies = name == BODIES and len(shape) == 2 and shape[1] == len(PARAMETERS)
-        kind: Kind = "inertia" if bodies else "signed" if name.endswith(SIGNED) else "positive"
+    rows: list[tuple[str, Kind]] = []
+    for path, leaf in jax.tree_util.tree_leaves_with_path(parameters):
+        name = jax.tree_util.keystr(path, simple=True, separator="_")
+        kind: Kind = "signed" if name.endswith(SIGNED) else "positive"
+        own = [f"{name}_{joint + 1}" for joint in range(np.size(leaf))]
         if name.startswith(COUPLING):
-            names, kinds, joints = [*names, name], [*kinds, "coupling"], [*joints, int(name.rpartition("_")[2]) - 1]
-            continue
-        for place in range(int(np.prod(shape))):
-            joint, which = divmod(place, len(PARAMETERS)) if bodies else (place, 0)
-            names.append(f"{PARAMETERS[which] if bodies else name}_{joint + 1}")
-            kinds.append(kind)
-            joints.append(joint)
-    return Columns(tuple(names), tuple(kinds), tuple(joints))
+            kind, own = "coupling", [name]
+        elif name == BODIES and np.shape(leaf)[1:] == (len(PARAMETERS),):
+            kind, own = "inertia", [f"{which}_{joint + 1}" for joint in range(len(leaf)) for which in PARAMETERS]
+        rows.extend((column, kind) for column in own)
+    return Columns(*zip(*rows, strict=True))
 
 
-def flat(parameters: Parameters) -> Float[np.ndarray, " P"]:
+def flat(parameters: Parameters) -> ParameterVector:
     """Concatenates all parameters in the order of the columns."""
-    leaves: list[Any] = [np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(parameters)]
-    return np.concatenate(leaves)
+    return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(parameters)]).astype(float)
 
 
 class Equations(NamedTuple):
@@ -96,11 +110,6 @@ class Equations(NamedTuple):
     """[Phi_j tau_j] = Q_j R_j."""
     samples: int
     """N."""
-
-    @property
-    def unknowns(self) -> int:
-        """P."""
-        return self.triangles.shape[2] - 1
 
 
 Regressor = Callable[[], Iterator[tuple[np.ndarray, np.ndarray]]]
@@ -142,39 +151,94 @@ def regressor_of(
 
 def compress(regressor: Regressor, weights: Float[np.ndarray, "N d"] | None = None) -> Equations:
     """Compresses the equations to triangular factors, with rows scaled by the square root of `weights`, if any."""
-    triangles, first = np.zeros((0, 0, 0)), 0
+    triangles, samples = None, 0
     for columns, tau in regressor():
         rows = np.concatenate([columns, tau[:, :, None]], axis=2)
         if weights is not None:
-            rows = rows * np.sqrt(weights[first : first + len(tau), :, None])
-        if not first:
-            triangles = np.zeros((rows.shape[1], rows.shape[2], rows.shape[2]))
-        first += len(tau)
-        for joint, factor in enumerate(triangles):
-            stacked = np.concatenate([factor, rows[:, joint]])
-            triangles[joint] = triangular_factor(stacked[:, :-1], stacked[:, -1])
-    return Equations(triangles, first)
+            rows = rows * np.sqrt(weights[samples : samples + len(tau), :, None])
+        samples += len(tau)
+        rows = rows.swapaxes(0, 1)
+        triangles = np.linalg.qr(rows if triangles is None else np.concatenate([triangles, rows], axis=1), mode="r")
+    if triangles is None:
+        raise InputError("there are no equations; expected at least one sample")
+    return Equations(triangles, samples)
 
 
-def about(equations: Equations, theta: Float[np.ndarray, " P"]) -> Equations:
-    """The equations for theta' - theta as the unknown."""
-    shifted = equations.triangles.copy()
-    shifted[:, :, -1] -= equations.triangles[:, :, :-1] @ theta
-    return equations._replace(triangles=shifted)
-
-
-def whiten(equations: Equations, noise: Float[np.ndarray, " d"]) -> Float[np.ndarray, "K P_and_1"]:
+def whiten(equations: Equations, noise: JointVector) -> Float[np.ndarray, "K P_and_1"]:
     """One triangular factor of all joints, with rows in units of the joint's noise."""
-    rows = (equations.triangles / noise[:, None, None]).reshape(-1, equations.unknowns + 1)
-    return triangular_factor(rows[:, :-1], rows[:, -1])
+    return np.linalg.qr(np.concatenate(equations.triangles / noise[:, None, None]), mode="r")
 
 
-def squares(equations: Equations, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, " d"]:
+def squares(equations: Equations, theta: ParameterVector) -> JointVector:
     """Sum of squared residuals over the samples, per joint."""
-    rows = equations.triangles @ np.append(theta, -1.0)
-    return np.sum(rows**2, axis=1)
+    return np.sum((equations.triangles @ np.append(theta, -1.0)) ** 2, axis=1)
 
 
-def residuals(regressor: Regressor, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, "N d"]:
+def residuals(regressor: Regressor, theta: ParameterVector) -> Float[np.ndarray, "N d"]:
     """tau - Phi theta of every sample."""
     return np.concatenate([tau - columns @ theta for columns, tau in regressor()])
+
+
+class BaseParameters(NamedTuple):
+    """B identifiable combinations of P parameters."""
+
+    combinations: Float[np.ndarray, "B P"]
+    """beta = combinations theta; every row has a 1 in its independent column."""
+    independent: tuple[int, ...]
+    """Independent column of every combination."""
+    words: tuple[str, ...]
+    """Combinations as text, such as "I_xx_3 + 0.3 m_4"."""
+
+
+def base_parameters(A: Float[np.ndarray, "N P"], columns: Columns) -> BaseParameters:
+    """Finds the base parameters by the triangular factor of the columns in their order of preference.
+
+    Args:
+        A: Phi in generic states, more of them than parameters, or its triangular factor.
+        columns: names and kinds of the columns.
+    """
+    preferred = columns.bodies[:, [PARAMETERS.index(name) for name in PREFERRED]]
+    order = np.append(preferred, np.flatnonzero(np.array(columns.kinds) != "inertia"))
+    scaled, lengths = scaled_columns(A, NEGLIGIBLE)
+    remainders = np.diagonal(np.linalg.qr(scaled[:, order], mode="r"))
+    independent = np.sort(order[abs(remainders) > DEPENDENT]).tolist()
+    # Solve with columns of unit length, then scale back.
+    factors = np.linalg.lstsq(scaled[:, independent], scaled, rcond=None)[0]
+    combinations = factors * lengths / lengths[independent][:, None]
+    combinations[abs(factors) < SHOWN * abs(factors).max(axis=1, initial=0.0)[:, None]] = 0.0
+    combinations[:, independent] = np.eye(len(independent))
+    words = tuple(in_words(row, columns.names, column) for row, column in zip(combinations, independent, strict=True))
+    return BaseParameters(combinations, tuple(independent), words)
+
+
+def in_words(combination: ParameterVector, names: Sequence[str], first: int) -> str:
+    """Writes a combination as a sum, starting with this column, whose factor is 1."""
+    others = np.flatnonzero(combination)
+    text = names[first]
+    for column in others[others != first]:
+        factor = combination[column]
+        size = "" if abs(abs(factor) - 1) < SHOWN else f"{abs(factor):.4g} "
+        text += f" {'-' if factor < 0 else '+'} {size}{names[column]}"
+    return text
+
+
+def determinacy(A: Float[np.ndarray, "N P"]) -> tuple[Determinacy, ...]:
+    """Classifies every parameter as identifiable alone, in combination or not at all.
+
+    Args:
+        A: as for `null_directions`.
+    """
+    shares = np.linalg.norm(null_directions(A), axis=0)
+    return tuple("alone" if s < SHARE else "not at all" if s > 1 - SHARE else "in combination" for s in shares)
+
+
+def null_directions(A: Float[np.ndarray, "N P"]) -> Float[np.ndarray, "K P"]:
+    """Orthonormal directions of the parameters that the equations do not determine, for columns scaled to unit length.
+
+    A column of zeros has a direction of its own.
+
+    Args:
+        A: Phi, or its triangular factor.
+    """
+    _, sizes, right = np.linalg.svd(np.linalg.qr(scaled_columns(A, NEGLIGIBLE)[0], mode="r"))
+    return right[int(np.sum(sizes > DEPENDENT * sizes.max(initial=0.0))) :]

@@ -29,13 +29,12 @@ from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.identification.consistent import fit_consistent
-from dln_jax.identification.equations import Columns
+from dln_jax.identification.equations import Columns, JointVector, ParameterVector
 from dln_jax.learning.linear import unravelled
 from dln_jax.learning.shooting import MeasuredWindows, cut_measured_windows, motion, without_start
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model
 from dln_jax.precision import quick_compilation
-from dln_jax.solvers.least_squares import triangular_factor
 from dln_jax.types import InputError, require_positive
 
 ROUNDS, SETTLED = 12, 1e-4
@@ -47,8 +46,8 @@ STABLE = 2.785
 """Largest product of time step and damping of a stable classical Runge-Kutta step."""
 MOST_GROWTH = 1e6
 """If deviations grow more along a window, its derivatives have too few correct digits."""
-SHORTEST_STEP = 1 / 64
-"""The search ends below this fraction of a step."""
+STEPS = 0.5 ** np.arange(8)
+"""Fractions of a step that are tried."""
 TYPICAL_DELAY = 1e-3
 """Unit of the delay among the unknowns, s."""
 
@@ -56,7 +55,7 @@ TYPICAL_DELAY = 1e-3
 class MotionFit(NamedTuple):
     """Parameters that fit motions."""
 
-    theta: Float[np.ndarray, " P"]
+    theta: ParameterVector
     delay: float
     """Delay of the motions behind the logged torques, s."""
     before: float
@@ -80,14 +79,14 @@ def cut_motions(data: Trajectories, length: int) -> tuple[MeasuredWindows, Float
 
 @functools.lru_cache(maxsize=4)
 def linearise(model: Model) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
-    """(theta [P], delay, noise_q [d], noise_tau [d], windows, slope) -> residuals [W, T d + d] and their derivatives.
+    """(unknowns [P + 1], noise_q [d], noise_tau [d], windows, slope) -> residuals [W, T d + d] and their derivatives.
 
-    The derivatives are [W, T d + d, P + 1]; the last column is that of the delay, in units of `TYPICAL_DELAY`.
-    Residuals are those of the nearest starts.
+    The last unknown is the delay, in units of `TYPICAL_DELAY`; the derivatives are [W, T d + d, P + 1]. Residuals are
+    those of the nearest starts.
     """
     like = jax.eval_shape(model.init, jax.random.key(0))
 
-    def one(unknowns: Array, noise_q: Array, noise_tau: Array, window: tuple[Array, ...]) -> Array:
+    def one(unknowns: Array, noise_q: Array, noise_tau: Array, window: tuple[Array, ...]) -> tuple[Array, Array]:
         t, q, qd, tau, weight, slope = window
         d = q.shape[1]
 
@@ -99,68 +98,38 @@ def linearise(model: Model) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
             return jnp.concatenate([jnp.ravel(off), start[2 * d :]])
 
         frozen, first = jax.lax.stop_gradient(unknowns), jnp.concatenate([q[0], qd[0], jnp.zeros(d)])
-        return without_start(lambda start: error(frozen, start), lambda start: error(unknowns, start), first)
+        left = without_start(lambda start: error(frozen, start), lambda start: error(unknowns, start), first)
+        return left, left
 
-    def both(unknowns: Array, *arguments) -> tuple[Array, Array]:
-        def value(unknowns: Array) -> tuple[Array, Array]:
-            left = one(unknowns, *arguments)
-            return left, left
+    with_slopes = jax.vmap(jax.jacfwd(one, has_aux=True), in_axes=(None, None, None, 0))
+    every = jax.jit(with_slopes, compiler_options=quick_compilation())
 
-        slopes, left = jax.jacfwd(value, has_aux=True)(unknowns)
-        return left, slopes
-
-    every = jax.jit(jax.vmap(both, in_axes=(None, None, None, 0)), compiler_options=quick_compilation())
-
-    def linearised(
-        theta, delay, noise_q, noise_tau, windows: MeasuredWindows, slope: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        unknowns = np.append(theta, delay / TYPICAL_DELAY)
+    def linearised(unknowns, noise_q, noise_tau, windows: MeasuredWindows, slope) -> tuple[np.ndarray, np.ndarray]:
         count, parts = len(windows.t), []
         with jax.enable_x64(True):
             for first in range(0, count, CHUNK):
                 rows = np.minimum(np.arange(first, first + CHUNK), count - 1)  # one shape, so one program
                 chunk = tuple(jnp.asarray(array[rows]) for array in (*windows, slope))
-                parts.append([np.asarray(part) for part in every(unknowns, noise_q, noise_tau, chunk)])
-        left, slopes = (np.concatenate(part)[:count] for part in zip(*parts, strict=True))
+                parts.append(every(unknowns, noise_q, noise_tau, chunk))
+        slopes, left = (np.concatenate(part)[:count] for part in zip(*parts, strict=True))
         return left, slopes
 
     return linearised
 
 
-def distances(
-    linearised: Callable,
-    start: Float[np.ndarray, " P"],
-    noise_tau: Float[np.ndarray, " d"],
-    windows: MeasuredWindows,
-    slope: Float[np.ndarray, "W T d"],
-) -> Float[np.ndarray, " d"]:
-    """Root mean square distance of every joint's simulated motion from the measured one, rad or m, in two rounds.
-
-    The first round has a thousandth of the spread of q as noise; each moves the compromise between starts and torques.
-    """
-    d = windows.q.shape[2]
-    noise = spread = np.maximum(1e-3 * windows.q.reshape(-1, d).std(axis=0), np.finfo(float).tiny)
-    for _ in range(2):
-        left = linearised(start, 0.0, noise, noise_tau, windows, slope)[0][:, : windows.q[0].size]
-        sizes = np.sum(left.reshape(-1, d) ** 2, axis=0) / windows.weight.sum()
-        noise = np.maximum(noise * np.sqrt(sizes), 1e-3 * spread)
-    return noise
-
-
 @functools.lru_cache(maxsize=4)
 def _damping(model: Model) -> Callable[..., Array]:
-    """(theta [P], q [n, T, d], qd [n, T, d], tau [n, T, d]) -> d qdd / d qd [n, T, d, d]."""
+    """(theta [P], q [n, d], qd [n, d], tau [n, d]) -> d qdd / d qd [n, d, d]."""
     like = jax.eval_shape(model.init, jax.random.key(0))
 
-    def slopes(theta: Array, q: Array, qd: Array, tau: Array) -> Array:
-        system = dynamics(model.energies(unravelled(theta, like)))
-        return jax.jacfwd(lambda qd: system.forward_dynamics(q, qd, tau))(qd)
+    def slopes(theta: Array, *state: Array) -> Array:
+        forward_dynamics = dynamics(model.energies(unravelled(theta, like))).forward_dynamics
+        return jax.jacfwd(forward_dynamics, argnums=1)(*state)
 
-    along = jax.vmap(jax.vmap(slopes, in_axes=(None, 0, 0, 0)), in_axes=(None, 0, 0, 0))
-    return jax.jit(along, compiler_options=quick_compilation())
+    return jax.jit(jax.vmap(slopes, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
 
 
-def _require_resolved(model: Model, theta: Float[np.ndarray, " P"], windows: MeasuredWindows) -> None:
+def _require_resolved(model: Model, theta: ParameterVector, windows: MeasuredWindows) -> None:
     """Raises `InputError` if derivatives of most windows grow without bound, as with steep dry friction near rest.
 
     A classical Runge-Kutta step multiplies a deviation that decays as exp(-z) by 1 - z + z²/2 - z³/6 + z⁴/24, which
@@ -169,12 +138,12 @@ def _require_resolved(model: Model, theta: Float[np.ndarray, " P"], windows: Mea
     step = float(np.median(np.diff(windows.t, axis=1)[windows.weight[:, 1:] > 0]))
     rows = np.linspace(0, len(windows.t) - 1, CHUNK).astype(int)  # one shape, so one program
     with jax.enable_x64(True):
-        states = (jnp.asarray(array[rows]) for array in (windows.q, windows.qd, windows.tau))
-        damping = np.asarray(_damping(model)(jnp.asarray(theta), *states))
+        states = (np.concatenate(array[rows]) for array in (windows.q, windows.qd, windows.tau))
+        damping = np.asarray(_damping(model)(theta, *states))
     if not np.isfinite(damping).all():
         return  # the motions are not finite either, which has a message of its own
     z = step * np.abs(np.linalg.eigvals(damping)).max(axis=-1)
-    growth = np.prod(np.maximum(np.abs(1 - z + z**2 / 2 - z**3 / 6 + z**4 / 24), 1.0), axis=1)
+    growth = np.maximum(np.abs(1 - z + z**2 / 2 - z**3 / 6 + z**4 / 24), 1.0).reshape(CHUNK, -1).prod(axis=1)
     if np.median(growth) > MOST_GROWTH:
         raise InputError(
             f"friction acts up to {z.max() / STABLE:.3g} times faster than the log's step of {step:.3g} s resolves; "
@@ -185,12 +154,12 @@ def _require_resolved(model: Model, theta: Float[np.ndarray, " P"], windows: Mea
 def fit_motions(
     model: Model,
     columns: Columns,
-    prior: Float[np.ndarray, " P"],
-    start: Float[np.ndarray, " P"],
+    prior: ParameterVector,
+    start: ParameterVector,
     windows: MeasuredWindows,
     slope: Float[np.ndarray, "W T d"],
     *,
-    noise_tau: Float[np.ndarray, " d"],
+    noise_tau: JointVector,
     torques: Float[np.ndarray, "K P_and_1"] | None = None,
     reweightings: int = REWEIGHTINGS,
 ) -> MotionFit:
@@ -211,57 +180,47 @@ def fit_motions(
     """
     require_positive(noise_tau=float(np.min(noise_tau)))
     _require_resolved(model, start, windows)
-    linearised = linearise(model)
-    noise_q = distances(linearised, start, noise_tau, windows, slope)
-    P = len(start)
-    wider = Columns((*columns.names, "delay"), (*columns.kinds, "signed"), (*columns.joints, 0))
+    linearised, P, (_, samples, d) = linearise(model), len(start), windows.q.shape
+    measured = windows.weight.sum()
+    x = np.append(start, 0.0)
+    # The noise of q is the distance of the motions. The first round has a thousandth of the spread of q as noise; each
+    # moves the compromise between starts and torques.
+    noise_q = spread = np.maximum(1e-3 * windows.q.reshape(-1, d).std(axis=0), np.finfo(float).tiny)
+    for _ in range(2):
+        left = linearised(x, noise_q, noise_tau, windows, slope)[0][:, : samples * d]
+        sizes = np.sum(left.reshape(-1, d) ** 2, axis=0) / measured
+        noise_q = np.maximum(noise_q * np.sqrt(sizes), 1e-3 * spread)
+    wider = Columns((*columns.names, "delay"), (*columns.kinds, "signed"))
     fixed = np.zeros((0, P + 2)) if torques is None else np.insert(torques, P, 0.0, axis=1)
-    measured = np.sqrt(windows.weight.sum() * windows.q.shape[2])
-    motions = windows.q.shape[1] * windows.q.shape[2]
-    prior = np.append(prior, 0.0)
 
-    def at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        left, slopes = linearised(x[:-1], TYPICAL_DELAY * x[-1], noise_q, noise_tau, windows, slope)
-        total = float(np.sum(left**2) + np.sum((fixed @ np.append(x, -1.0)) ** 2))
-        return left, slopes, total
+    def at(x: np.ndarray, weight: np.ndarray = windows.weight) -> tuple[np.ndarray, np.ndarray, float]:
+        left, slopes = linearised(x, noise_q, noise_tau, windows._replace(weight=weight), slope)
+        return left, slopes, float(np.sum(left**2) + np.sum((fixed @ np.append(x, -1.0)) ** 2))
 
     def distance(left: np.ndarray) -> float:
-        return float(np.linalg.norm(left[:, :motions]) / measured)
+        return float(np.linalg.norm(left[:, : samples * d]) / np.sqrt(measured * d))
 
-    def descended(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, bool]:
-        left, slopes, total = at(x)
+    left = at(x)[0]
+    before, weight, rounds, converged = distance(left), windows.weight, 0, False
+    for _ in range(1 + reweightings):
+        left, slopes, total = at(x, weight)
         if not np.isfinite(total):
             raise InputError("motions simulated with the initial fit are not finite; record faster, or filter less")
-        done, converged = 0, False
-        while done < ROUNDS and not converged:
-            done += 1
-            J, r = slopes.reshape(-1, P + 1), left.ravel()
-            rows = np.concatenate([np.column_stack([J, J @ x - r]), fixed])
-            triangle = triangular_factor(rows[:, :-1], rows[:, -1])
-            target = fit_consistent(triangle, wider, prior)
-            length, was = 1.0, total
-            while True:
-                candidate = x + length * (target.theta - x)
-                left, slopes, total = at(candidate)
-                if (np.isfinite(total) and total < was) or length < SHORTEST_STEP:
+        last, converged = rounds + ROUNDS, False
+        while rounds < last and not converged:
+            rounds += 1
+            J, was = slopes.reshape(-1, P + 1), total
+            rows = np.concatenate([np.column_stack([J, J @ x - left.ravel()]), fixed])
+            step = fit_consistent(np.linalg.qr(rows, mode="r"), wider, np.append(prior, 0.0)).theta - x
+            for length in STEPS:
+                left, slopes, total = at(x + length * step, weight)
+                if total < was:
+                    x, converged = x + length * step, was - total < SETTLED * was
                     break
-                length /= 2
-            if np.isfinite(total) and total < was:
-                x, converged = candidate, was - total < SETTLED * was
             else:
-                left, slopes, total = at(x)
                 converged = True  # no step lowers the sum
-        return x, left, done, converged
-
-    x, equal, rounds, converged = np.append(start, 0.0), windows, 0, False
-    before = distance(at(x)[0])
-    for weighting in range(1 + reweightings):
-        if weighting:
-            windows = equal
-            norms = np.linalg.norm(at(x)[0], axis=1)
-            usual = np.minimum(1.0, np.median(norms) / np.maximum(norms, np.finfo(float).tiny))
-            windows = equal._replace(weight=equal.weight * usual[:, None])
-        x, _, done, converged = descended(x)
-        rounds += done
-    windows = equal
-    return MotionFit(x[:-1], TYPICAL_DELAY * float(x[-1]), before, distance(at(x)[0]), rounds, converged)
+        left = at(x)[0]
+        norms = np.linalg.norm(left, axis=1)
+        usual = np.minimum(1.0, np.median(norms) / np.maximum(norms, np.finfo(float).tiny))
+        weight = windows.weight * usual[:, None]
+    return MotionFit(x[:-1], TYPICAL_DELAY * float(x[-1]), before, distance(left), rounds, converged)

@@ -22,11 +22,10 @@ from dln_jax.learning import dynamics
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.objectives import SCALED_TORQUE, arrays, residuals, squared_torque_errors
-from dln_jax.learning.select import Trial, segments, select
+from dln_jax.learning.select import Trial, mean_of_segments, select
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.residual import ResidualParameters, frozen, make_residual, make_with_residual
 from dln_jax.types import InputError, Needs, ResidualTerm
-from dln_jax.zoo.descriptions import Description, describe
 
 
 class Candidate(NamedTuple):
@@ -95,9 +94,9 @@ def fit_residual(
     """
     if not candidates or candidates[0].terms:
         raise InputError("candidates start with a network; the first must be none, which the others have to improve on")
-    began = time.perf_counter()
+    until = time.perf_counter() + seconds
     with jax.enable_x64(True):
-        scale, segment = np.asarray(SCALED_TORQUE.scale(train)), segments(validation)
+        scale = np.asarray(SCALED_TORQUE.scale(train))
         batch = arrays(SCALED_TORQUE, train, jnp.float64)
         unexplained = jax.jit(lambda: residuals(SCALED_TORQUE, rigid.energies(parameters), batch))()
         magnitudes = {"torque_scale": unexplained, "rate_scale": train.qd, "acceleration_scale": train.qdd}
@@ -107,28 +106,19 @@ def fit_residual(
         }
 
         def errors(model: Model, parameters: Parameters) -> Float[np.ndarray, " segments"]:
-            squares = np.sum(squared_torque_errors(model, parameters, validation, scale), axis=1)
-            return np.bincount(segment, squares) / np.bincount(segment)
+            squares = squared_torque_errors(model, parameters, validation, scale)
+            return mean_of_segments(validation, np.sum(squares, axis=1))
 
         def attempt(candidate: Candidate) -> tuple[Any, Float[np.ndarray, " segments"]]:
             if not candidate.terms:
                 return None, errors(rigid, parameters)
-            time_left = began + seconds - time.perf_counter()
-            if time_left <= 0:
-                return None, np.full(segment.max() + 1, np.inf)
             settings = {**candidate._asdict(), **sizes}
             both = make_with_residual(rigid, make_residual(needs, **settings))
             problem = dynamics.problem(frozen(both, parameters), Split(train, validation, validation), SCALED_TORQUE)
-            training = fit(problem, GaussNewton(steps=iterations), seconds=time_left)
+            training = fit(problem, GaussNewton(steps=iterations), seconds=max(until - time.perf_counter(), 1e-9))
             whole = ResidualParameters(parameters, training.parameters)
             return (both, whole, settings), errors(both, whole)
 
-        chosen, trials = select(candidates, attempt, patience=2)
+        chosen, trials = select(candidates, attempt, patience=2, until=until)
     model, whole, settings = (rigid, parameters, {}) if chosen.outcome is None else chosen.outcome
     return ResidualFit(model, whole, chosen.candidate, settings, trials)
-
-
-def with_network(description: Description, added: ResidualFit) -> Description:
-    """Description of a model with its residual network."""
-    keywords = {key: value for key, value in description.items() if key not in ("name", "precision")}
-    return describe(f"{description['name']}-residual", precision="f64", **keywords, **added.settings)

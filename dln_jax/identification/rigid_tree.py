@@ -1,32 +1,66 @@
 """A robot as a model: friction with fitted shapes, and terms that only cross-validation adds.
 
-Such terms are coupled motors, friction by load and friction by temperature.
+Any extra term lowers the error on its own training data, whether or not the plant has it. `choose_terms` therefore
+keeps a term only if it lowers the error in cross-validation over trajectories (or blocks of time) by more than `MARGIN`
+standard errors. Such terms are coupled motors, friction that depends on load, and friction that depends on temperature.
+
+`shared_motor` looks for motors that turn with two joints, such as those of coupled wrists, in torques that a fit leaves
+unexplained. A motor with the rate m = qd_j + c qd_i, i < j, has friction F(m), which acts on both joints:
+
+    left_j = F_j(qd_j) + F(m),    left_i = F_i(qd_i) + c F(m),    F(v) = b v + k tanh(v / s)
+
+Its share is what F(m) explains beyond friction of the joints' own rates, in that joint of the two where it is less.
 """
 
-from typing import Any
+import functools
+import itertools
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import every
-from dln_jax.identification.base import DEPENDENT, unit_columns
+from dln_jax.data.splits import BLOCKS, every, in_blocks
+from dln_jax.identification.equations import determinacy
 from dln_jax.identification.identify import STATES, random_states
-from dln_jax.learning.friction import FrictionFit, Terms, choose_terms, fit_friction, known_of, terms_of
+from dln_jax.learning.friction import (
+    FrictionFit,
+    Known,
+    Terms,
+    equations,
+    fit_friction,
+    known_of,
+    link_signs,
+    solve_terms,
+)
+from dln_jax.learning.select import mean_of_segments, significantly_better
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction.laws import FrictionShape
+from dln_jax.mechanics.friction import FrictionShape
 from dln_jax.mechanics.trees.description import Tree, tree_to_json
 from dln_jax.mechanics.trees.motors import Pair
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.trees import Rows
 from dln_jax.precision import quick_compilation
-from dln_jax.types import Needs
+from dln_jax.types import FrictionLaw, Needs
 from dln_jax.zoo.descriptions import Description, build, describe
 
-MOST_SAMPLES = 4_000
-"""Largest number of samples used to fit the shapes of friction."""
+MOST_SAMPLES, FEWER_SAMPLES = 4_000, 2_000
+"""Largest number of samples used to fit the shapes of friction, and for the fits of a cross-validation."""
+FOLDS = 4
+MARGIN = 2.0
+"""A term must lower the error by this number of standard errors; about one log in forty does so by chance."""
+RATIOS = (-2.0, -1.5, -1.0, -0.75, -0.5, -0.25, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
+"""Values of c that are tried."""
+SHARE = 0.3
+"""Smallest share of the unexplained variance in both joints."""
+SMOOTH = 0.1
+"""s, as a share of the root mean square rate."""
+MOST = 4000
+"""Number of samples that is enough to find a motor."""
 
 
 def describe_rigid_tree(
@@ -53,42 +87,30 @@ def describe_rigid_tree(
     Raises:
         InputError: as for `fit_friction`.
     """
-    tree, scale = robot.tree, {} if velocity_scale is None else {"velocity_scale": velocity_scale}
-    start, held = FrictionShape(**scale), tuple(scale)
-    terms = terms_of(tuple(law for law in needs.joint_friction if law != "load"), start, held, motors=motors)
-    lines, candidates = [], []
+    tree, stated = robot.tree, {} if velocity_scale is None else {"velocity_scale": velocity_scale}
+    laws: tuple[FrictionLaw, ...] = tuple(law for law in needs.joint_friction if law != "load")
+    terms = Terms(laws, FrictionShape(**stated), tuple(stated), motors=motors)
+    lines, additions = [], {}
     for pair in coupled:
         name = f"armature between the motors of joints {pair[0] + 1} and {pair[1] + 1}"
-        if is_identifiable(tree, terms, pair):
-            candidates.append((name, terms._replace(coupled=(pair,))))
+        if is_identifiable(tree, motors, pair):
+            additions[name] = {"coupled": (pair,)}
         else:
             lines.append(f"{name}: left out, as other inertias explain all its torques; state --motors if it is known")
     if "load" in needs.joint_friction:
-        candidates.append(("friction by load", terms_of(("load",), start, held, motors=motors)))
+        additions["friction by load"] = {"laws": ("load",)}
     if cooling:
-        candidates.append(("friction by temperature", terms._replace(learned=("cooling",))))
-    terms, tried = choose_terms(tree, train, terms, candidates)
+        additions["friction by temperature"] = {"cooling": True}
+    terms, tried = choose_terms(tree, train, terms, additions)
     lines += [
         f"{term.name}: {'kept' if term.kept else 'left out'}; cross-validation error {term.within:.4g} with it, "
         f"{term.without:.4g} without"
         for term in tried
     ]
-    fitted = None
-    keywords: dict[str, Any] = {"motors": motors, "coupled": terms.coupled, **scale}
+    fitted, keywords = None, {"motors": motors, "coupled": terms.coupled, **stated}
     if terms.learned:
-        fitted = fit_friction(
-            tree,
-            every(train, -(-len(train.t) // MOST_SAMPLES)),
-            terms.laws,
-            shape=start,
-            held=held,
-            cooling="cooling" in terms.learned,
-            motors=motors,
-            coupled=terms.coupled,
-        )
-        keywords |= {name: values.tolist() for name, values in fitted.shape.items()}
-        if fitted.reference_temperature is not None:
-            keywords["reference_temperature"] = fitted.reference_temperature
+        fitted = fit_friction(tree, every(train, -(-len(train.t) // MOST_SAMPLES)), **terms._asdict())
+        keywords = fitted.keywords
     needs = needs._replace(joint_friction=terms.laws)
     return describe("rigid-tree", precision="f64", needs=needs, tree=tree_to_json(tree), **keywords), fitted, lines
 
@@ -103,17 +125,69 @@ def build_rigid_tree(description: Description, robot: Robot) -> tuple[Model, Par
     )
 
 
-def is_identifiable(tree: Tree, terms: Terms, pair: Pair) -> bool:
+def is_identifiable(tree: Tree, motors: Rows | None, pair: Pair) -> bool:
     """Whether torques of arbitrary motions tell the armature of a pair from inertias of links and motors."""
     states = random_states(tree.joints, STATES * tree.degrees_of_freedom, 0)
     with jax.enable_x64(True):
-        links = known_of(
-            tree, states, terms._replace(laws=(), learned=(), coupled=(*terms.coupled, pair)), noise=1.0
-        ).links
-    A = unit_columns(np.asarray(links).reshape(-1, links.shape[2]))[0]
-    others, column = A[:, :-1], A[:, -1]
-    left = column - others @ np.linalg.lstsq(others, column, rcond=DEPENDENT)[0]
-    return bool(np.linalg.norm(left) > np.sqrt(DEPENDENT))
+        links = known_of(tree, states, Terms((), motors=motors, coupled=(pair,)), noise=1.0).links
+    return determinacy(np.asarray(links).reshape(-1, links.shape[2]))[-1] == "alone"
+
+
+class TriedTerm(NamedTuple):
+    """A term and the errors with and without it."""
+
+    name: str
+    without: float
+    """Mean squared error in cross-validation, summed over joints, in units of each torque's variance."""
+    within: float
+    """The same, with the term."""
+    kept: bool
+
+
+def choose_terms(
+    tree: Tree, data: Trajectories, terms: Terms, additions: Mapping[str, Mapping[str, Any]]
+) -> tuple[Terms, list[TriedTerm]]:
+    """Tries additions one after another and keeps those that lower the cross-validation error significantly.
+
+    Args:
+        additions: what each candidate adds to entries of `terms`, by its name, such as {"laws": ("load",)}.
+
+    Raises:
+        InputError: as for `fit_friction`.
+    """
+    if not additions:
+        return terms, []
+    if len(np.unique(data.trajectory)) < FOLDS:
+        data = in_blocks(data, BLOCKS)
+    data = every(data, -(-len(data.t) // FEWER_SAMPLES))
+    errors, tried = cross_validate(tree, data, terms), []
+    for name, added in additions.items():
+        wider = terms._replace(**{entry: getattr(terms, entry) + more for entry, more in added.items()})
+        trial = cross_validate(tree, data, wider)
+        kept = significantly_better(trial, errors, margin=MARGIN)
+        tried.append(TriedTerm(name, float(errors.mean()), float(trial.mean()), kept))
+        if kept:
+            terms, errors = wider, trial
+    return terms, tried
+
+
+def cross_validate(tree: Tree, data: Trajectories, terms: Terms) -> Float[np.ndarray, " segments"]:
+    """Mean squared error of every segment, from fits to the folds without it."""
+    fold_of = np.unique(data.trajectory, return_inverse=True)[1] % FOLDS
+    fewest = len(fold_of) - np.bincount(fold_of).max()
+    with jax.enable_x64(True):
+        known, design = known_of(tree, data, terms), functools.partial(equations, terms)
+        evaluate = jax.jit(design)
+        squares = np.zeros(len(data.t))
+        for fold in range(FOLDS):
+            held, rest = fold_of == fold, np.flatnonzero(fold_of != fold)
+            # The same number of samples in every fold, so that one compiled program serves all.
+            rows = rest[np.linspace(0, len(rest) - 1, fewest).round().astype(int)]
+            solution = solve_terms(terms, Known(*(part[rows] for part in known)), design)
+            whole = known._replace(signs=link_signs(terms, known, solution))
+            A, b = map(np.asarray, evaluate(solution.nonlinear, whole))
+            squares[held] = np.sum((A @ solution.linear - b).reshape(len(data.t), -1) ** 2, axis=1)[held]
+    return mean_of_segments(data, squares)
 
 
 def at_reference(
@@ -132,3 +206,32 @@ def at_reference(
     change = jax.jit(jax.vmap(warmer), compiler_options=quick_compilation())
     with jax.enable_x64(True):
         return [log._replace(tau=log.tau - np.asarray(change(log.q, log.qd, log.temperature))) for log in logs]
+
+
+def shared_motor(left: Float[np.ndarray, "N d"], qd: Float[np.ndarray, "N d"]) -> tuple[int, int, float, float] | None:
+    """Returns j, i (from 0), c and the share of the motor that explains most; `None` if none explains enough."""
+    from scipy.linalg import block_diag  # imported here, after commands have set BLAS's threads
+
+    scale, best = left.std(axis=0), None
+    moving = np.flatnonzero((scale > 0) & (qd.std(axis=0) > 0))
+    for j, i in itertools.combinations(moving[::-1], 2):
+        own = [np.column_stack([_friction(qd[:, k]), np.ones(len(qd))]) for k in (j, i)]
+        alone, y = np.asarray(block_diag(*own)), np.concatenate([left[:, k] / scale[k] for k in (j, i)])
+        before = _unexplained(alone, y)
+        for c in RATIOS:
+            of_motor = _friction(qd[:, j] + c * qd[:, i])
+            on_both = np.concatenate([of_motor / scale[j], c * of_motor / scale[i]])
+            share = float(np.min(1 - _unexplained(np.column_stack([alone, on_both]), y) / before))
+            if share >= SHARE and (best is None or share > best[3]):
+                best = int(j), int(i), c, share
+    return best
+
+
+def _friction(rate: np.ndarray) -> np.ndarray:
+    return np.column_stack([rate, np.tanh(rate / (SMOOTH * np.sqrt(np.mean(rate**2)) + 1e-300))])
+
+
+def _unexplained(A: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Mean square of what least squares leave of both joints."""
+    left = y - A @ np.linalg.lstsq(A, y, rcond=None)[0]
+    return np.mean(left.reshape(2, -1) ** 2, axis=1) + 1e-300

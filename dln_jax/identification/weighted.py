@@ -13,9 +13,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.identification import equations
-from dln_jax.identification.base import unit_columns
-from dln_jax.identification.equations import Equations, Regressor, compress, residuals
+from dln_jax.identification.equations import (
+    NEGLIGIBLE,
+    Equations,
+    JointVector,
+    ParameterVector,
+    Regressor,
+    compress,
+    residuals,
+    squares,
+    whiten,
+)
+from dln_jax.solvers.least_squares import scaled_columns
 from dln_jax.types import InputError
 
 ROUNDING = 1e-10
@@ -35,10 +44,10 @@ REWEIGHTINGS, SETTLED = 30, 1e-4
 class WeightedFit(NamedTuple):
     """Least-squares fit of P parameters to d joints."""
 
-    theta: Float[np.ndarray, " P"]
+    theta: ParameterVector
     covariance: Float[np.ndarray, "P P"]
     """Includes every direction with an effect on the data, even those too weak to be used in the fit."""
-    noise: Float[np.ndarray, " d"]
+    noise: JointVector
     """Standard deviation of the residual of each joint, N m or N."""
     rank: int
     """Number of combinations that the data determine."""
@@ -48,7 +57,7 @@ class WeightedFit(NamedTuple):
     """Orthonormal directions along which theta keeps its prior value, in units of the columns' lengths."""
     without_effect: Float[np.ndarray, "M P"]
     """Returns the directions of `unseen` that have no effect on the data."""
-    lengths: Float[np.ndarray, " P"]
+    lengths: ParameterVector
     """Lengths of the columns in units of noise; zero for columns without effect."""
 
     def standard_errors(self, combinations: Float[np.ndarray, "B P"]) -> Float[np.ndarray, " B"]:
@@ -61,10 +70,10 @@ class WeightedFit(NamedTuple):
 
 def fit_weighted(
     data: Equations,
-    known: Float[np.ndarray, " P"],
+    known: ParameterVector,
     *,
-    noise: Float[np.ndarray, " d"] | None = None,
-    correlation: Float[np.ndarray, " d"] | None = None,
+    noise: JointVector | None = None,
+    correlation: JointVector | None = None,
 ) -> WeightedFit:
     """Fits the parameters by weighted least squares.
 
@@ -80,20 +89,20 @@ def fit_weighted(
     Raises:
         InputError: noise is not positive, tau is zero, or samples are too few.
     """
-    d, known = len(data.triangles), np.asarray(known, float)
+    d = len(data.triangles)
     torque = np.sqrt(np.sum(data.triangles[:, :, -1] ** 2, axis=1) / data.samples)
     if not torque.any():
         raise InputError("tau is zero in every sample; identification takes measured torques")
     if noise is not None and not (np.shape(noise) == (d,) and np.all(np.asarray(noise) > 0)):
         raise InputError(f"noise is {noise}; expected a positive number for each of {d} joints")
-    if data.samples * d <= data.unknowns:
-        raise InputError(f"{data.samples} samples of {d} joints for {data.unknowns} parameters; record more")
-    shifted = equations.about(data, known)
+    if data.samples * d <= len(known):
+        raise InputError(f"{data.samples} samples of {d} joints for {len(known)} parameters; record more")
+    shifted = data._replace(triangles=data.triangles.copy())  # for theta - known as the unknown
+    shifted.triangles[:, :, -1] -= data.triangles[:, :, :-1] @ known
     sigma = np.full(d, torque.mean()) if noise is None else np.asarray(noise, float)
     for _ in range(ROUNDS if noise is None else 0):
         fit, shares = _solve(shifted, sigma, None, ROUNDING)
-        freedoms = np.maximum(data.samples - shares, 1.0)
-        deviation = np.sqrt(equations.squares(shifted, fit.theta) / freedoms)
+        deviation = np.sqrt(squares(shifted, fit.theta) / np.maximum(data.samples - shares, 1.0))
         before, sigma = sigma, np.maximum(deviation, NOISE_FLOOR * torque.max())
         if (abs(sigma - before) <= 1e-6 * sigma).all():
             break
@@ -106,15 +115,16 @@ def _solve(
     data: Equations, sigma: np.ndarray, correlation: np.ndarray | None, rank_tolerance: float
 ) -> tuple[WeightedFit, np.ndarray]:
     """The fit for these noise levels, and every joint's share in determining the parameters; shares sum to the rank."""
-    triangle = equations.whiten(data, sigma)
-    scaled, lengths = unit_columns(triangle[:, :-1])
+    triangle = whiten(data, sigma)
+    scaled, lengths = scaled_columns(triangle[:, :-1], NEGLIGIBLE)
+    effective = scaled.any(axis=0)
     left, sizes, right = np.linalg.svd(scaled)
     rank, effects = (int(np.sum(sizes > t * sizes[0])) for t in (rank_tolerance, ROUNDING))
-    to_theta = (right[:effects] / sizes[:effects, None]).T / np.where(lengths > 0, lengths, 1.0)[:, None]
-    to_theta[lengths == 0] = 0.0  # large torques in units of small noise would amplify rounding here
+    to_theta = (right[:effects] / sizes[:effects, None]).T / lengths[:, None]
+    to_theta[~effective] = 0.0  # large torques in units of small noise would amplify rounding here
     # Rows of each joint in the basis of directions with an effect: their squares sum to one over all joints.
     by_joint = data.triangles[:, :, :-1] / sigma[:, None, None] @ to_theta
-    times = np.ones(len(sigma)) if correlation is None else np.asarray(correlation, float)
+    times = np.ones(len(sigma)) if correlation is None else correlation
     middle = np.einsum("d,dki,dkj->ij", times, by_joint, by_joint)
     fit = WeightedFit(
         theta=to_theta[:, :rank] @ (left[:, :rank].T @ triangle[:, -1]),
@@ -124,35 +134,31 @@ def _solve(
         condition=float(sizes[0] / sizes[rank - 1]) if rank else np.inf,
         unseen=right[rank:],
         without_effect=right[effects:],
-        lengths=lengths,
+        lengths=np.where(effective, lengths, 0.0),
     )
     return fit, np.sum(by_joint[:, :, :rank] ** 2, axis=(1, 2))
 
 
-def correlation_times(errors: Float[np.ndarray, "N d"], trajectory: np.ndarray) -> Float[np.ndarray, " d"]:
+def correlation_times(errors: Float[np.ndarray, "N d"], trajectory: np.ndarray) -> JointVector:
     """Correlation time of every joint's residuals in samples; 1 for independent ones.
 
     1 + 2 sum of autocorrelations within trajectories, up to the first pair of lags whose sum is not positive (Geyer
     1992).
     """
-    starts = np.flatnonzero(np.diff(trajectory)) + 1
-    parts = np.split(errors, starts)
+    from scipy.signal import fftconvolve
+
+    parts = np.split(errors, np.flatnonzero(np.diff(trajectory)) + 1)
     longest = max(len(part) for part in parts)
     products = np.zeros((longest, errors.shape[1]))
     for part in parts:
-        # Zero padding to twice the length keeps the correlation from wrapping round.
-        spectrum = abs(np.fft.rfft(part, 2 * len(part), axis=0)) ** 2
-        products[: len(part)] += np.fft.irfft(spectrum, 2 * len(part), axis=0)[: len(part)]
+        products[: len(part)] += fftconvolve(part, part[::-1], axes=0)[len(part) - 1 :]
     correlations = products / np.where(products[0] > 0, products[0], 1.0)
-    times = np.ones(errors.shape[1])
-    for joint, values in enumerate(correlations.T):
-        pairs = values[: 2 * (longest // 2)].reshape(-1, 2).sum(axis=1)
-        end = np.argmax(pairs <= 0) if (pairs <= 0).any() else len(pairs)
-        times[joint] = max(2 * pairs[:end].sum() - 1, 1.0)  # the pairs include lag 0, which is 1
-    return times
+    pairs = correlations[: 2 * (longest // 2)].reshape(-1, 2, errors.shape[1]).sum(axis=1)
+    ended = np.logical_or.accumulate(pairs <= 0, axis=0)
+    return np.maximum(2 * np.sum(np.where(ended, 0.0, pairs), axis=0) - 1, 1.0)  # the pairs include lag 0, which is 1
 
 
-def fit_robust(regressor: Regressor, known: Float[np.ndarray, " P"]) -> tuple[WeightedFit, Float[np.ndarray, "N d"]]:
+def fit_robust(regressor: Regressor, known: ParameterVector) -> tuple[WeightedFit, Float[np.ndarray, "N d"]]:
     """Huber's estimate: the loss grows linearly instead of quadratically beyond `THRESHOLD` times the noise.
 
     Iteratively reweighted least squares with weights min(1, threshold noise / |error|), returned with the fit; the

@@ -26,8 +26,7 @@ from jaxtyping import Float
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
 from dln_jax.learning.select import Trial
-from dln_jax.mechanics.friction.curves import unit_force
-from dln_jax.mechanics.friction.laws import FrictionShape, coefficients_of
+from dln_jax.mechanics.friction import FrictionShape, coefficients_of, unit_force
 from dln_jax.models.joint_friction import FrictionParameters
 from dln_jax.models.kernel import KernelParameters, KernelScales, States, torque_covariance
 from dln_jax.precision import quick_compilation

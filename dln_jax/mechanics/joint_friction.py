@@ -12,6 +12,8 @@ The corner at tau_link = 0 remains: derivatives there are those of μ = 0, the m
 has no loss by load unless other friction loads the transmission.
 """
 
+import operator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -19,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from dln_jax.mechanics.dynamics import Dynamics, InverseForward, PhaseRates, friction_force, make_dynamics
-from dln_jax.mechanics.friction.curves import joint_rates
+from dln_jax.mechanics.friction import joint_rates
 from dln_jax.types import Dissipation, Potential, Scalar, Vector
 
 
@@ -86,15 +88,22 @@ def sum_of(first: Dissipation | None, second: Dissipation) -> Dissipation:
 
 def carrying(load: Load, qd: Vector, tau_link: Vector) -> Vector:
     """Returns the generalised force tau [d] before the transmissions, from tau_link behind them."""
-    at_joints = _to_joints(load, tau_link)
-    # By the sign, whose derivative is 0; that of the absolute value is one-sided.
-    return _from_joints(load, at_joints * (1 + jnp.sign(at_joints) * _slope(load, qd)))
+    return _through(load, qd, tau_link, operator.mul)
 
 
 def carried(load: Load, qd: Vector, tau: Vector) -> Vector:
     """Returns the generalised force tau_link [d] behind the transmissions, from tau before them; inverts `carrying`."""
-    at_joints = _to_joints(load, tau)
-    return _from_joints(load, at_joints / (1 + jnp.sign(at_joints) * _slope(load, qd)))
+    return _through(load, qd, tau, operator.truediv)
+
+
+def _through(load: Load, qd: Vector, tau: Vector, by: Callable[[Array, Array], Array]) -> Vector:
+    """Multiplies or divides the forces at the joints, which Jᵀ maps to generalised forces, by 1 ± μ tanh(u / v)."""
+    J = None if load.joint_map is None else np.asarray(load.joint_map, float)
+    at_joints = tau if J is None else jnp.asarray(np.linalg.inv(J).T, tau.dtype) @ tau
+    slope = jnp.asarray(load.share, qd.dtype) * jnp.tanh(joint_rates(load.joint_map, qd) / load.velocity_scale)
+    # By the sign, whose derivative is 0; that of the absolute value is one-sided.
+    at_joints = by(at_joints, 1 + jnp.sign(at_joints) * slope)
+    return at_joints if J is None else jnp.asarray(J, tau.dtype).T @ at_joints
 
 
 def link_force(system: LoadedSystem, q: Vector, qd: Vector, tau: Vector) -> Vector:
@@ -123,10 +132,6 @@ def _dissipating(system: Any, dissipation: Dissipation | None) -> Any:
 
 
 def _plain(system: InverseForward | PhaseRates, friction: LoadedSystem) -> InverseForward | PhaseRates:
-    def before(q: Vector, qd: Vector, tau_link: Vector) -> Vector:
-        tau = carrying(friction.load, qd, tau_link)
-        return tau if friction.dissipation is None else tau + friction_force(friction.dissipation, q, qd)
-
     if isinstance(system, PhaseRates):
 
         def rates(q: Vector, p: Vector) -> tuple[Array, Array]:
@@ -134,23 +139,9 @@ def _plain(system: InverseForward | PhaseRates, friction: LoadedSystem) -> Inver
             return qd, pd + link_force(friction, q, qd, jnp.zeros_like(qd))
 
         return PhaseRates(rates)
-    return InverseForward(
-        lambda q, qd, qdd: before(q, qd, system.inverse_dynamics(q, qd, qdd)),
-        lambda q, qd, tau: system.forward_dynamics(q, qd, link_force(friction, q, qd, tau)),
-    )
 
+    def inverse(q: Vector, qd: Vector, qdd: Vector) -> Vector:
+        tau = carrying(friction.load, qd, system.inverse_dynamics(q, qd, qdd))
+        return tau if friction.dissipation is None else tau + friction_force(friction.dissipation, q, qd)
 
-def _slope(load: Load, qd: Vector) -> Vector:
-    """Returns μ tanh(u / v), within (-1, 1)."""
-    return jnp.asarray(load.share, qd.dtype) * jnp.tanh(joint_rates(load.joint_map, qd) / load.velocity_scale)
-
-
-def _to_joints(load: Load, tau: Vector) -> Vector:
-    """Returns the forces at the joints, which Jᵀ maps to generalised forces."""
-    if load.joint_map is None:
-        return tau
-    return jnp.asarray(np.linalg.inv(np.asarray(load.joint_map, float)).T, tau.dtype) @ tau
-
-
-def _from_joints(load: Load, force: Vector) -> Vector:
-    return force if load.joint_map is None else jnp.asarray(load.joint_map, force.dtype).T @ force
+    return InverseForward(inverse, lambda q, qd, tau: system.forward_dynamics(q, qd, link_force(friction, q, qd, tau)))

@@ -18,8 +18,15 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import DTypeLike
 
-from dln_jax.mechanics.friction.curves import joint_dissipation, require_shape
-from dln_jax.mechanics.friction.laws import FrictionCoefficients, FrictionShape, coefficients_of, require_laws, shape_of
+from dln_jax.mechanics.friction import (
+    FrictionCoefficients,
+    FrictionShape,
+    coefficients_of,
+    joint_dissipation,
+    require_laws,
+    require_shape,
+    shape_of,
+)
 from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, Needs
@@ -71,13 +78,13 @@ def with_joint_friction(
     start = FrictionShape(velocity_scale=needs.velocity_scale) if shape is None else shape
     require_shape(start)
     d = needs.degrees_of_freedom
-    learned = () if linear else tuple(name for name in shape_of(laws) if name != HELD)
+    learned = [name for name in shape_of(laws) if name != HELD and not linear] + ["load"] * ("load" in laws)
+    starts = {"sigmoid_shift": start.sigmoid_shift, "load": START}
 
     def init(key: Array) -> Parameters:
         friction = FrictionParameters(
             {name: jnp.full(d, 0.0 if linear or name == "offset" else START, dtype) for name in coefficients_of(laws)},
-            {name: jnp.full(d, start.sigmoid_shift if name == "sigmoid_shift" else 0.0, dtype) for name in learned}
-            | ({"load": jnp.full(d, START, dtype)} if "load" in laws else {}),
+            {name: jnp.full(d, starts.get(name, 0.0), dtype) for name in learned},
         )
         return {"model": model.init(key), "friction": friction}
 

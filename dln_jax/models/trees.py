@@ -34,8 +34,15 @@ from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from dln_jax.mechanics.closed_form import RecursiveSystem
-from dln_jax.mechanics.friction.curves import joint_dissipation, require_shape
-from dln_jax.mechanics.friction.laws import USUAL, FrictionCoefficients, FrictionShape, coefficients_of, require_laws
+from dln_jax.mechanics.friction import (
+    USUAL,
+    FrictionCoefficients,
+    FrictionShape,
+    coefficients_of,
+    joint_dissipation,
+    require_laws,
+    require_shape,
+)
 from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.motors import Pair, armature_matrix, motors_of, require_motors
@@ -96,7 +103,7 @@ def make_rigid_tree(
 
     Args:
         tree: its inertias and armature are the initial parameters; friction is initially zero.
-        friction: laws whose coefficients are also parameters, as in `mechanics.friction.laws`; True: `USUAL`.
+        friction: laws whose coefficients are also parameters, as in `mechanics.friction`; True: `USUAL`.
         velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift: as in `FrictionShape`; they are not fitted.
         load: share of the load law, 0 <= μ < 1; not fitted. With it, forces are not linear in the parameters.
         cooling: k, 1/K; not fitted.

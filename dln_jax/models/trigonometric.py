@@ -44,7 +44,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.friction.curves import joint_dissipation
+from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.models.model import Model
 from dln_jax.types import InputError, JointKind, Matrix, Needs, Scalar, Vector, require_positive
 

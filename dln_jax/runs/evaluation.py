@@ -25,7 +25,7 @@ from dln_jax.learning.linear import design, design_chunks
 from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction.curves import joint_dissipation
+from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees.recursions import tree_system
 from dln_jax.metrics.coverage import LEVEL, coverage
 from dln_jax.metrics.errors import as_arrays, definiteness, errors, mean_square, prediction_program, samples_of

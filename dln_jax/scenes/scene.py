@@ -8,14 +8,13 @@ from jaxtyping import Array
 
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.friction.curves import joint_dissipation
-from dln_jax.mechanics.friction.laws import FrictionCoefficients, FrictionShape
+from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape, joint_dissipation
 from dln_jax.mechanics.joint_friction import sum_of
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.types import Dissipation, FrictionLaw, InputError, JointKind, Lagrangian, Needs, Potential, Vector
 
 LAWS: tuple[FrictionLaw, ...] = ("viscous", "coulomb", "stribeck")
-"""Friction laws available for a scene; the others of `mechanics.friction.laws` apply to gears."""
+"""Friction laws available for a scene; the others of `mechanics.friction` apply to gears."""
 
 
 class Scene(NamedTuple):

@@ -56,11 +56,11 @@ def test_the_slope_of_windows_is_that_of_finite_differences(place):
     windows = cut_motions(from_arrays(arrays), 21)
     assert len(windows[1]) == 10
     at, scales = linearise(model), (np.array([1e-3]), np.array([0.1]))
-    left, slopes = at(theta, 0.0, *scales, *windows)
+    left, slopes = at(np.append(theta, 0.0), *scales, *windows)
     assert np.abs(left).max() < 1e-6
     for column in (0, 4, 10, 11):  # mass (no effect on a joint through the origin), I_xx, armature, friction
         change = 1e-5 * np.eye(len(theta))[column]
-        above, below = (at(theta + sign * change, 0.0, *scales, *windows)[0] for sign in (1, -1))
+        above, below = (at(np.append(theta + sign * change, 0.0), *scales, *windows)[0] for sign in (1, -1))
         difference = (above - below) / 2e-5
         np.testing.assert_allclose(slopes[:, :, column], difference, atol=1e-4 * max(1.0, np.abs(difference).max()))
     stiff = np.concatenate([theta[:-1], [100.0]])

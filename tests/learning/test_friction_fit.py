@@ -10,9 +10,10 @@ from motions import sums_of_sines
 from planar_arm import ARM as PLANAR
 
 from dln_jax.data.schema import from_arrays
-from dln_jax.learning.friction import choose_terms, fit_friction, terms_of
+from dln_jax.identification.rigid_tree import choose_terms
+from dln_jax.learning.friction import Terms, fit_friction
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction.laws import FrictionShape
+from dln_jax.mechanics.friction import FrictionShape
 from dln_jax.models.trees import make_rigid_tree
 
 # Axes at a right angle: in a plane the second link's inertia is a coupling.
@@ -28,12 +29,7 @@ SHAPES = {
     "cooling": {"friction": LAWS, "cooling": (0.02, 0.01), "reference_temperature": 25.0},
 }
 """Friction of the plants, by what they have beside viscous and dry friction."""
-TERMS = terms_of(LAWS)
-CANDIDATES = {
-    "coupled": TERMS._replace(coupled=((0, 1),)),
-    "load": terms_of(("load",)),
-    "cooling": TERMS._replace(learned=("cooling",)),
-}
+CANDIDATES = {"coupled": {"coupled": ((0, 1),)}, "load": {"laws": ("load",)}, "cooling": {"cooling": True}}
 
 
 @functools.cache
@@ -69,7 +65,7 @@ def test_shapes_and_coefficients_are_found_within_their_errors(case):
     true = {name: value for name, value in SHAPES[case].items() if name != "friction"}
     laws = SHAPES[case]["friction"]
     fit = fit_friction(ARM, log_of(case, noise=0.01), laws, noise=1.0)
-    assert fit.converged
+    assert fit.solution.converged
     # The mean square of noise over 2 joints, less what the fit takes.
     assert fit.torque_mse == pytest.approx(2 * 0.01**2, rel=0.15)
     found = {**fit.parameters._asdict(), **fit.shape}
@@ -94,7 +90,7 @@ def test_cooling_and_coupling_are_found_within_their_errors():
     off = (fit.shape["cooling"] - np.array([0.02, 0.01])) / fit.shape_errors["cooling"]
     assert np.abs(off).max() < 3.5 and (fit.shape_errors["cooling"] < 2e-3).all()
     # The viscous coefficients are those at the reference, the log's mean temperature.
-    factor = np.exp(-np.array([0.02, 0.01]) * (fit.reference_temperature - 25))
+    factor = np.exp(-np.array([0.02, 0.01]) * (fit.keywords["reference_temperature"] - 25))
     off = (np.asarray(fit.parameters.viscous) - factor * [0.4, 0.3]) / np.asarray(fit.standard_errors.viscous)
     assert np.abs(off).max() < 3.5
     fit = fit_friction(ARM, log_of("coupled"), LAWS, coupled=((0, 1),), noise=NOISE)
@@ -104,14 +100,14 @@ def test_cooling_and_coupling_are_found_within_their_errors():
 
 @pytest.mark.parametrize("extra", ["nothing", "load"])
 def test_cross_validation_keeps_the_terms_of_the_plant_and_no_other(extra):
-    _, tried = choose_terms(ARM, log_of(extra, 1), TERMS, list(CANDIDATES.items()))
+    _, tried = choose_terms(ARM, log_of(extra, 1), Terms(LAWS), CANDIDATES)
     assert [term.name for term in tried if term.kept] == [name for name in CANDIDATES if name == extra]
 
 
 def test_what_is_no_fit_is_refused():
     data = log_of("nothing")
     for laws, options, message in [
-        (("coulomb",), {"cooling": True}, "friction has coulomb, which no temperature changes; add viscous"),
+        (("coulomb",), {"cooling": True}, "cooling is 1.0, but friction has coulomb; add 'viscous' to it"),
         (("viscous",), {"cooling": True}, "friction is to depend on temperature, which the data do not have"),
         (("coulomb",), {"noise": 0.0}, "noise is 0.0; expected a positive number"),
     ]:

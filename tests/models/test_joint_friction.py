@@ -8,7 +8,7 @@ from calls import one_line
 
 from dln_jax import joint_dissipation
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction.laws import LAWS, FrictionShape
+from dln_jax.mechanics.friction import LAWS, FrictionShape
 from dln_jax.models.joint_friction import friction_of, with_joint_friction
 from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import build, describe

@@ -14,7 +14,7 @@ from dln_jax.commands import COMMANDS, identify, train_delan, train_diffnet, tra
 from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.data.functions import PUBLISHED
 from dln_jax.learning.fits.settings import WAYS
-from dln_jax.mechanics.friction.laws import LAWS, USUAL
+from dln_jax.mechanics.friction import LAWS, USUAL
 from dln_jax.nn.activations import ALL
 from dln_jax.runs.arguments import arguments_for, resolved
 from dln_jax.runs.help import options_of

@@ -12,7 +12,7 @@ import dln_jax
 from dln_jax.data.log import log_of
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction.curves import joint_dissipation
+from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees.recursions import tree_system
 
 STATE = np.array([0.3, -0.5]), np.array([0.7, 0.4]), np.array([1.0, -2.0])

@@ -6,7 +6,7 @@ import pytest
 from calls import one_line
 
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction.laws import FrictionCoefficients, FrictionShape
+from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape
 from dln_jax.scenes.pendulums import cart_pole, two_link_pendulum
 from dln_jax.scenes.scene import with_friction
 

@@ -19,7 +19,7 @@ from dln_jax.learning.fits.network import plan_network
 from dln_jax.learning.fits.settings import Network
 from dln_jax.learning.gauges import summed_with_friction
 from dln_jax.mechanics import lagrangian
-from dln_jax.mechanics.friction.laws import USUAL
+from dln_jax.mechanics.friction import USUAL
 from dln_jax.scenes.datasets.generators import characters
 
 BRIEF = "--no-figures --no-uncertainty"

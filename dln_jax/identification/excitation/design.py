@@ -19,15 +19,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.identification.excitation.fourier import (
+from dln_jax.identification.excitation.limits import worst
+from dln_jax.identification.excitation.task import (
     FourierMotion,
+    Task,
     harmonic_functions,
     require_sampling,
     rest_basis,
     sample,
+    states,
 )
-from dln_jax.identification.excitation.limits import worst
-from dln_jax.identification.excitation.task import Task
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers.augmented_lagrangian import make_minimiser
@@ -56,26 +57,26 @@ class Design(NamedTuple):
     motion: FourierMotion
     information: Float[np.ndarray, "B B"]
     """A, averaged over samples."""
-    condition: float
-    """Condition of the regressor of base parameters with columns of unit length."""
-    log_determinant: float
-    """log det A."""
     slack: float
     """Smallest relative distance to a limit."""
     nearest: str
     """Limit with the smallest distance."""
 
+    @property
+    def condition(self) -> float:
+        """Condition of the regressor of base parameters with columns of unit length."""
+        return together([self])[0]
+
+    @property
+    def log_determinant(self) -> float:
+        """log det A."""
+        return together([self])[1]
+
 
 def functions_at(task: Task, finer: int = 1) -> list[np.ndarray]:
     """Harmonic functions and their first two derivatives, [N, 2 H] each, on the design grid refined by a factor."""
     t = task.period * np.arange(finer * task.steps) / (finer * task.steps)
-    return [*map(np.asarray, jax.vmap(lambda t: harmonic_functions(task.harmonics, task.period, t))(t))]
-
-
-def states(functions: list[np.ndarray], offset: Any, coefficients: Any) -> tuple[Any, Any, Any]:
-    """q, qd, qdd [N, d]."""
-    q, qd, qdd = (values @ jnp.asarray(coefficients).T for values in functions)
-    return offset + q, qd, qdd
+    return [*map(np.asarray, harmonic_functions(task.harmonics, task.period, t))]
 
 
 def furthest(task: Task, motion: FourierMotion) -> tuple[float, str]:
@@ -110,22 +111,17 @@ def shrink_to_limits(task: Task, motion: FourierMotion) -> tuple[Design | None, 
     return assess(task, shrunk(amplitude)), ""
 
 
-def weighted(task: Task, Phi: Any) -> Any:
-    """Regressor of the base parameters with rows divided by the joint's noise: [N, d, P] -> [N, d, B]."""
-    return Phi[..., task.columns] / task.noise[:, None]
+def average_information(task: Task, Phi: Any) -> Any:
+    """A of the regressors [N, d, P] of a motion on the design grid."""
+    W = (Phi[..., task.columns] / task.noise[:, None]).reshape(-1, task.columns.size)
+    return W.T @ W / task.steps
 
 
 def assess(task: Task, motion: FourierMotion) -> Design:
-    """Computes information, condition and slack of a motion."""
+    """Computes information and slack of a motion."""
     at = states(functions_at(task), motion.offset, motion.coefficients)
-    W = weighted(task, np.asarray(task.samples(*at)[0])).reshape(-1, task.columns.size)
-    lengths = np.linalg.norm(W, axis=0)
-    sizes = np.linalg.svd(W / np.where(lengths > 0, lengths, 1.0), compute_uv=False)
-    with np.errstate(divide="ignore"):
-        logarithm = 2 * np.sum(np.log(sizes)) + 2 * np.sum(np.log(lengths)) - len(sizes) * np.log(task.steps)
     beyond, kind = furthest(task, motion)
-    condition = float(sizes[0] / sizes[-1]) if sizes[-1] > 0 else np.inf
-    return Design(motion, W.T @ W / task.steps, condition, float(logarithm), -beyond, kind)
+    return Design(motion, average_information(task, np.asarray(task.samples(*at)[0])), -beyond, kind)
 
 
 def random_designs(task: Task, count: int, *, seed: int = 0) -> list[Design]:
@@ -145,10 +141,10 @@ def random_designs(task: Task, count: int, *, seed: int = 0) -> list[Design]:
     while len(designs) < count:
         coefficients = random.normal(size=(len(lower), 2 * task.harmonics)) * spectrum @ basis @ basis.T
         q, qd, qdd = (values @ coefficients.T for values in functions)
-        sizes = [np.ptp(q, axis=0) / (upper - lower)]
-        sizes += [abs(rate).max(axis=0) / bound for rate, bound in ((qd, limits.velocity), (qdd, limits.acceleration))]
-        scale = (1 - 2 * MARGIN) / np.max(sizes, axis=0)
-        free = (upper - lower) - scale * np.ptp(q, axis=0)
+        extent = np.ptp(q, axis=0)
+        rates = abs(qd).max(axis=0) / limits.velocity, abs(qdd).max(axis=0) / limits.acceleration
+        scale = (1 - 2 * MARGIN) / np.max([extent / (upper - lower), *rates], axis=0)
+        free = (upper - lower) - scale * extent
         offset = lower - scale * q.min(axis=0) + free * random.uniform(0.1, 0.9, len(lower))
         motion = FourierMotion(offset, scale[:, None] * coefficients, task.period)
         design, broken = shrink_to_limits(task, motion)
@@ -162,7 +158,7 @@ def random_designs(task: Task, count: int, *, seed: int = 0) -> list[Design]:
 
 
 Designer = Callable[..., Design]
-"""(starts, information already available [B, B] or `None`) -> the best design within the limits."""
+"""(starts, designs whose information is already available) -> the best design within the limits."""
 
 
 def _scaled(A: Float[Array, "B B"]) -> tuple[Float[Array, "B B"], Float[Array, " B"]]:
@@ -206,8 +202,7 @@ def make_designer(task: Task, criterion: Criterion, *, rounds: int = 8, iteratio
     def problem(x: Array, known: Array, margin: Array) -> tuple[Array, Array]:
         motion = states(functions, *series(x))
         Phi, _, beyond = jax.vmap(task.observe)(*motion)
-        W = weighted(task, Phi).reshape(-1, task.columns.size)
-        A = known + W.T @ W / task.steps
+        A = known + average_information(task, Phi)
         return criterion(A), jnp.concatenate([limit.ravel() + margin for limit in jax.tree.leaves(beyond)])
 
     minimise = make_minimiser(problem, rounds=rounds, iterations=iterations)
@@ -226,10 +221,8 @@ def make_designer(task: Task, criterion: Criterion, *, rounds: int = 8, iteratio
             margin += beyond + 2 * MARGIN
         return shrink_to_limits(task, motion)[0]
 
-    def best(starts: Sequence[Design], known: Any = None) -> Design:
-        if not starts:
-            raise InputError("there are no starts; expected at least one design")
-        known = np.zeros_like(starts[0].information) if known is None else np.asarray(known)
+    def best(starts: Sequence[Design], before: Sequence[Design] = ()) -> Design:
+        known = sum((design.information for design in before), np.zeros_like(starts[0].information))
 
         def worth(design: Design) -> float:
             value = float(criterion(jnp.asarray(known + design.information)))
@@ -269,8 +262,7 @@ def design_set(
     designs: list[Design] = []
     for place in range(trajectories + 1):
         own = drawn[place * starts : (place + 1) * starts]
-        known = sum(design.information for design in designs) if 0 < place < trajectories else None
-        designs.append(best(own, known))
+        designs.append(best(own, designs if place < trajectories else ()))
         say(place + 1, f"condition {designs[-1].condition:.3g}")
     return designs[:-1], designs[-1]
 
@@ -278,7 +270,7 @@ def design_set(
 def together(designs: Sequence[Design]) -> tuple[float, float]:
     """Condition and log det A of several motions of equal length taken together."""
     scaled, lengths = map(np.asarray, _scaled(jnp.asarray(np.mean([design.information for design in designs], axis=0))))
-    sizes = np.linalg.eigvalsh(scaled)
+    sizes = np.linalg.eigvalsh(np.nan_to_num(scaled))
     if not sizes[0] > 0:
         return np.inf, -np.inf
     return float(np.sqrt(sizes[-1] / sizes[0])), float(np.sum(np.log(sizes)) + 2 * np.sum(np.log(lengths)))
@@ -302,12 +294,10 @@ def as_trajectories(
     Raises:
         InputError: the rate is too low for the harmonics.
     """
-    motions = [design.motion for design in designs]
-    period = motions[0].period
-    require_sampling(period=period, harmonics=motions[0].harmonics, rate=rate)
-    t = np.linspace(0.0, period, round(period * rate) + 1)
-    q, qd, qdd = map(np.concatenate, zip(*(sample(motion, t) for motion in motions), strict=True))
-    force = jax.jit(jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics))
-    index = np.repeat(np.arange(len(motions)), len(t))
-    states = {"q": q, "qd": qd, "qdd": qdd, "tau": np.asarray(force(q, qd, qdd))}
-    return Trajectories(t=np.tile(t, len(motions)), trajectory=index, label=np.array(labels), needs=needs, **states)
+    count, first = len(designs), designs[0].motion
+    require_sampling(period=first.period, harmonics=first.harmonics, rate=rate)
+    t = np.linspace(0.0, first.period, round(first.period * rate) + 1)
+    q, qd, qdd = map(np.concatenate, zip(*(sample(design.motion, t) for design in designs), strict=True))
+    tau = np.asarray(jax.jit(jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics))(q, qd, qdd))
+    index = np.repeat(np.arange(count), len(t))
+    return Trajectories(np.tile(t, count), q, qd, qdd, tau, index, label=np.array(labels), needs=needs)

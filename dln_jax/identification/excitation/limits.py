@@ -17,7 +17,7 @@ from jaxtyping import Float
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.frames import world_frames
-from dln_jax.types import InputError, Vector
+from dln_jax.types import InputError
 
 SECONDS_TO_SPEED = 0.2
 """s: assumed time to full velocity if no acceleration limit is stated."""
@@ -55,18 +55,18 @@ class Excess(NamedTuple):
 
 def require_limits(limits: MotionLimits, degrees_of_freedom: int, names: tuple[str, ...] = ()) -> None:
     """Raises `InputError` that names the first joint with missing, empty or NaN limits."""
-    d = degrees_of_freedom
-    for kind, shape in (("position", (d, 2)), ("velocity", (d,)), ("acceleration", (d,)), ("force", (d, 2))):
-        array = np.asarray(getattr(limits, kind))
+    for kind, array in limits._asdict().items():
+        shape = (degrees_of_freedom, 2)[: 2 if kind in ("position", "force") else 1]
         if array.shape != shape:
             raise InputError(f"limits of {kind} have shape {array.shape}; expected {shape}")
         for joint, limit in enumerate(array):
             name = names[joint] if names else str(joint)
-            if np.isnan(limit).any() or (kind != "force" and np.isinf(limit).any()):
+            low, high = limit if len(shape) == 2 else (0.0, limit)
+            if np.isnan([low, high]).any() or (kind != "force" and np.isinf(low - high)):
                 raise InputError(f"joint '{name}' has no limit of {kind}; state one")
-            if np.isinf(limit).any() and not (limit[0] == -np.inf and limit[1] == np.inf):
+            if np.isinf(low) != np.isinf(high):
                 raise InputError(f"joint '{name}' has a limit of {kind} on one side, {limit}; expected both or none")
-            if not (limit[0] < limit[1] if len(shape) == 2 else limit > 0):
+            if not low < high:
                 raise InputError(f"joint '{name}' has limits of {kind} {limit}; expected lower < upper, and rates > 0")
 
 
@@ -96,45 +96,45 @@ def limits_of_robot(
         InputError: a joint that is not in `allow_unlimited` lacks a limit, a limit of velocity or of a prismatic
             joint's position is missing, a pattern matches no joint, or an argument has the wrong number of limits.
     """
-    tree, assumed = robot.tree, []
-    d, names = tree.degrees_of_freedom, tree.names or tuple(map(str, range(tree.degrees_of_freedom)))
+    tree, d, assumed = robot.tree, robot.tree.degrees_of_freedom, []
+    names = tree.names or tuple(map(str, range(d)))
+    rates = {"velocity": np.broadcast_to(robot.velocity_limits, d), "acceleration": None}
+    limits = {"position": robot.position_limits, **rates, "force": robot.force_limits}
     stated = {"position": position, "velocity": velocity, "acceleration": acceleration, "force": force}
-    stated = {kind: limit for kind, limit in stated.items() if limit is not None}
     for kind, limit in stated.items():
+        if limit is None:
+            continue
         if np.size(limit) not in (1, d):
             raise InputError(f"{kind} has {np.size(limit)} numbers; expected one, or one for each of the {d} joints")
         sizes = np.broadcast_to(np.ravel(limit), d)
-        stated[kind] = np.stack([-sizes, sizes], axis=1) if kind in ("position", "force") else sizes
+        limits[kind] = sizes if kind in rates else np.stack([-sizes, sizes], axis=1)
     for pattern in allow_unlimited:
         if not fnmatch.filter(names, pattern):
             raise InputError(f"there is no joint '{pattern}' to allow without limits; it has {', '.join(names)}")
     allowed = np.array([any(fnmatch.fnmatchcase(name, pattern) for pattern in allow_unlimited) for name in names])
-
-    def unlimited(kind: str, option: str, absent: np.ndarray) -> str:
-        """Names of the joints without a limit, which must be allowed; empty if there are none."""
+    if limits["acceleration"] is None:
+        limits["acceleration"] = limits["velocity"] / SECONDS_TO_SPEED
+        assumed.append(f"no limits of acceleration: full velocity in {SECONDS_TO_SPEED} s is assumed")
+    revolute = np.array(tree.joints) == "revolute"
+    for kind, option, may_lack, words in (
+        ("position", "--position", revolute, "pi to either side is assumed"),
+        ("force", "--torque", True, "any is allowed"),
+    ):
+        absent = ~np.isfinite(limits[kind]).all(axis=1) & may_lack
         if (refused := absent & ~allowed).any():
             name = names[int(np.argmax(refused))]
             raise InputError(
                 f"joint '{name}' has no limit of {kind}: state it ({option}, or in the file), or give "
                 f"--allow-unlimited {name} if it may go anywhere and take any torque"
             )
-        return "any joint" if absent.all() else ", ".join(np.array(names)[absent])
-
-    positions = stated.get("position", robot.position_limits)
-    free = ~np.isfinite(positions).all(axis=1) & (np.array(tree.joints) == "revolute")
-    if listed := unlimited("position", "--position", free):
-        assumed.append(f"no limits of position for {listed}: pi to either side is assumed")
-        positions = np.where(free[:, None], [-np.pi, np.pi], positions)
-    velocities = stated.get("velocity", np.broadcast_to(robot.velocity_limits, d))
-    if "acceleration" not in stated:
-        assumed.append(f"no limits of acceleration: full velocity in {SECONDS_TO_SPEED} s is assumed")
-    accelerations = stated.get("acceleration", velocities / SECONDS_TO_SPEED)
-    forces = stated.get("force", robot.force_limits)
-    if listed := unlimited("force", "--torque", ~np.isfinite(forces).all(axis=1)):
-        assumed.append(f"no limits of force for {listed}: any is allowed")
-    limits = MotionLimits(positions, velocities, accelerations, forces)
-    require_limits(limits, d, names)
-    return limits, assumed
+        if absent.any():
+            listed = "any joint" if absent.all() else ", ".join(np.array(names)[absent])
+            assumed.append(f"no limits of {kind} for {listed}: {words}")
+        if kind == "position":
+            limits[kind] = np.where(absent[:, None], [-np.pi, np.pi], limits[kind])
+    checked = MotionLimits(**limits)
+    require_limits(checked, d, names)
+    return checked, assumed
 
 
 def heights_above(tree: Tree, height: float) -> Clearance | None:
@@ -153,25 +153,12 @@ def scale_limits(limits: MotionLimits, share: float) -> MotionLimits:
     return MotionLimits(position, share * limits.velocity, share * limits.acceleration, share * limits.force)
 
 
-def excess(
-    limits: MotionLimits, clearance: Clearance | None, q: Vector, qd: Vector, qdd: Vector, tau: Vector
-) -> Excess:
-    """Excess of one state and its force."""
-    bounded = np.isfinite(limits.force).all(axis=1)
-    return Excess(
-        position=_beyond(limits.position, q),
-        velocity=jnp.abs(qd) / limits.velocity - 1,
-        acceleration=jnp.abs(qdd) / limits.acceleration - 1,
-        force=_beyond(limits.force[bounded], tau[bounded]) if bounded.any() else None,
-        clearance=None if clearance is None else -clearance(q),
-    )
-
-
-def _beyond(bounds: np.ndarray, x: Array) -> Array:
+def beyond(bounds: np.ndarray, x: Array) -> Array:
+    """Excess of numbers over bounds [n, 2], relative to half the range."""
     middle, half = bounds.mean(axis=1), np.diff(bounds, axis=1)[:, 0] / 2
     return jnp.abs(x - middle) / half - 1
 
 
-def worst(beyond: Excess) -> tuple[float, str]:
+def worst(excess: Excess) -> tuple[float, str]:
     """The largest excess over all samples, and its limit; fields as of `excess`, with sample axes in front."""
-    return max((float(np.max(values)), kind) for kind, values in beyond._asdict().items() if values is not None)
+    return max((float(np.max(values)), kind) for kind, values in excess._asdict().items() if values is not None)

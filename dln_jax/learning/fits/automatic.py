@@ -34,7 +34,7 @@ from dln_jax.learning.objectives import SCALED_TORQUE, require_scales, squared_t
 from dln_jax.learning.select import Trial, lowest, mean_of_segments, select, simplest
 from dln_jax.learning.selection import say_selection
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction.laws import USUAL
+from dln_jax.mechanics.friction import USUAL
 from dln_jax.mechanics.trees.description import tree_to_json
 from dln_jax.metrics.errors import definiteness
 from dln_jax.models.trees import RigidTreeParameters, tree_of

@@ -10,7 +10,7 @@ from dln_jax.learning.fits.settings import Arm, LearnedTree
 from dln_jax.learning.kinematics.fit import fit_tree
 from dln_jax.learning.kinematics.frames import KinematicPrior, kinematic_prior_from_json
 from dln_jax.learning.kinematics.search import Search
-from dln_jax.mechanics.friction.laws import USUAL
+from dln_jax.mechanics.friction import USUAL
 from dln_jax.scale import device_lines
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import describe_for

@@ -23,7 +23,8 @@ from dln_jax.identification.excitation.design import CRITERIA, Design, make_desi
 from dln_jax.identification.excitation.limits import MotionLimits
 from dln_jax.identification.excitation.task import make_task
 from dln_jax.identification.identify import identify, parameters_of
-from dln_jax.learning.friction import choose_terms, fit_friction, terms_of
+from dln_jax.identification.rigid_tree import choose_terms
+from dln_jax.learning.friction import Terms, fit_friction
 from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.weak_forms import fit_momentum
 from dln_jax.mechanics.equations import dynamics
@@ -142,12 +143,7 @@ def added_terms(*, logs_without: int = 20, logs_with: int = 5) -> Numbers:
 
     An arm of two joints moves for 20 s while its gears warm up; torques have noise of about 1 % of their size.
     """
-    terms = terms_of(PLANT_LAWS)
-    candidates = {
-        "coupled": terms._replace(coupled=((0, 1),)),
-        "load": terms_of(("load",)),
-        "temperature": terms._replace(learned=("cooling",)),
-    }
+    additions = {"coupled": {"coupled": ((0, 1),)}, "load": {"laws": ("load",)}, "temperature": {"cooling": True}}
     numbers = {}
     for plant, keywords in PLANTS.items():
         count = logs_without if plant == "none" else logs_with
@@ -161,7 +157,7 @@ def added_terms(*, logs_without: int = 20, logs_with: int = 5) -> Numbers:
             return dynamics(energies(parameters, temperature)).inverse_dynamics(q, qd, qdd)
 
         program = jax.jit(jax.vmap(torque))
-        kept = {f"share_keeping_{name}": 0.0 for name in candidates}
+        kept = {f"share_keeping_{name}": 0.0 for name in additions}
         for seed in range(count):
             random, w = np.random.default_rng(seed), np.arange(1.0, 6.0)[:, None]
             t = STEP * np.arange(SAMPLES)
@@ -171,7 +167,7 @@ def added_terms(*, logs_without: int = 20, logs_with: int = 5) -> Numbers:
             state["temperature"] = np.stack([20 + 25 * (1 - np.exp(-t / 8))] * 2, axis=1)
             tau = np.asarray(program(**state)) + NOISE * random.normal(size=(SAMPLES, 2))
             log = from_arrays({"t": t, "trajectory": np.zeros(SAMPLES, int), "tau": tau, **state})
-            for tried in choose_terms(ARM, log, terms, list(candidates.items()))[1]:
+            for tried in choose_terms(ARM, log, Terms(PLANT_LAWS), additions)[1]:
                 kept[f"share_keeping_{tried.name}"] += tried.kept / count
         numbers[f"added-terms/{plant}"] = kept
     return numbers

@@ -18,7 +18,7 @@ from dln_jax.control.estimate.external import (
 )
 from dln_jax.control.state_space import field_of, integrated
 from dln_jax.mechanics.dynamics import PlainDynamics
-from dln_jax.mechanics.friction.laws import FrictionCoefficients, FrictionShape
+from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape
 from dln_jax.mechanics.trees.description import serial
 from dln_jax.mechanics.trees.frames import frame_jacobian, world_frames
 from dln_jax.scenes.pendulums import two_link_pendulum

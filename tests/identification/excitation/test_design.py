@@ -18,9 +18,14 @@ from dln_jax.identification.excitation.design import (
     states,
     together,
 )
-from dln_jax.identification.excitation.fourier import require_sampling, sample, state
 from dln_jax.identification.excitation.limits import MotionLimits, heights_above, scale_limits, worst
-from dln_jax.identification.excitation.task import independent_columns, linear_force, make_task
+from dln_jax.identification.excitation.task import (
+    independent_columns,
+    linear_force,
+    make_task,
+    require_sampling,
+    sample,
+)
 from dln_jax.learning.linear import fit_linear, linearised
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees.frames import world_frames
@@ -94,7 +99,8 @@ def test_motions_rest_at_both_ends_and_rates_are_derivatives(task, informative):
     q, qd, qdd = sample(motion, np.array([0.0, task.period]))
     np.testing.assert_allclose(q[0], q[1], atol=1e-12)
     np.testing.assert_allclose([qd, qdd], 0, atol=1e-12)
-    (_, *rates), slopes = jax.jit(lambda t: jax.jvp(lambda t: state(motion, t), (t,), (1.0,)))(0.7)
+    at = np.array([0.7])
+    (_, *rates), slopes = jax.jit(lambda t: jax.jvp(lambda t: sample(motion, t), (t,), (0 * t + 1,)))(at)
     np.testing.assert_allclose(slopes[:2], rates, atol=1e-12)
 
 

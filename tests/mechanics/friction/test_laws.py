@@ -10,8 +10,15 @@ from calls import one_line
 from dln_jax import joint_dissipation
 from dln_jax.mechanics.dynamics import friction_force
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction.curves import POTENTIALS, unit_force
-from dln_jax.mechanics.friction.laws import LAWS, FrictionShape, coefficients_of, require_laws, shape_of
+from dln_jax.mechanics.friction import (
+    LAWS,
+    POTENTIALS,
+    FrictionShape,
+    coefficients_of,
+    require_laws,
+    shape_of,
+    unit_force,
+)
 from dln_jax.scenes.pendulums import two_link_arm
 
 SHAPE = FrictionShape(velocity_scale=0.02, stribeck_velocity=0.3, sigmoid_slope=8.0, sigmoid_shift=-0.05)

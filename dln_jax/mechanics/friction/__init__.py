@@ -1,1 +1,0 @@
-"""Friction of joints: laws, their Rayleigh functions, and load-dependent friction of transmissions."""
