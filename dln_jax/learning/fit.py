@@ -12,9 +12,9 @@ import numpy as np
 
 from dln_jax.data.parts import Parts
 from dln_jax.learning import dynamics
+from dln_jax.learning.dynamics import summed_with_friction
 from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Progress, Stop, Training
-from dln_jax.learning.gauges import summed_with_friction
 from dln_jax.learning.kinematics.fit import TreeFit
 from dln_jax.learning.objectives import SCALED_TORQUE, Objective
 from dln_jax.learning.uncertainty import estimate

@@ -6,6 +6,8 @@ samples (the one-standard-error rule of Breiman et al. 1984, paired). The rule `
 no other betters significantly.
 """
 
+import io
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -13,8 +15,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from rich.console import Console
+from rich.table import Table
 
 from dln_jax.data.schema import Trajectories
+from dln_jax.files import write_json
+from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.types import InputError
 
 SEGMENT = 0.5
@@ -124,3 +130,28 @@ def mean_of_segments(data: Trajectories, errors: Float[np.ndarray, "N ..."]) -> 
     counts = np.bincount(numbers)
     means = [np.bincount(numbers, column) / counts for column in errors.reshape(len(errors), -1).T]
     return np.stack(means, axis=1).reshape(len(counts), *errors.shape[1:])
+
+
+def say_selection(context: Context, title: str, kept: str, ended: str, rows: Sequence[dict[str, Any]]) -> None:
+    """Says a table of the candidates, and why the selection ended; writes both into the run's folder.
+
+    Args:
+        kept: name of the kept candidate.
+        ended: why no further candidate was tried; empty if all were.
+        rows: a dictionary for each candidate, with its `name`; lists and texts are not shown.
+    """
+    shown = [key for key in dict.fromkeys(itertools.chain(*rows)) if key not in ("name", "joints", "reason")]
+    table = Table("model", *(key.replace("_", " ") for key in shown), "", title=title)
+    for row in rows:
+        values = (row.get(key) for key in shown)
+        numbers = [
+            f"{value:.3g}" if isinstance(value, float) else "" if value is None else f"{value}" for value in values
+        ]
+        table.add_row(row["name"], *numbers, "kept" if row["name"] == kept else "")
+    text = io.StringIO()
+    Console(file=text, highlight=False, soft_wrap=True).print(table)
+    context.say(text.getvalue().rstrip())
+    if ended:
+        context.say(f"no further model was tried: {ended}")
+    if context.folder is not None:
+        write_json(context.folder / "selection.json", {"kept": kept, "ended": ended, "candidates": list(rows)})

@@ -15,7 +15,7 @@ from dln_jax.data.log import read_log
 from dln_jax.data.parts import split_log
 from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import Robot
-from dln_jax.learning.context import Context
+from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.learning.fits import automatic, tree
 from dln_jax.learning.fits.settings import Automatic
 

@@ -15,9 +15,9 @@ from dln_jax.data import schema
 from dln_jax.data.log import read_log
 from dln_jax.data.parts import split_log
 from dln_jax.data.schema import from_arrays
+from dln_jax.learning.dynamics import summed_with_friction
 from dln_jax.learning.fits.network import plan_network
 from dln_jax.learning.fits.settings import Network
-from dln_jax.learning.gauges import summed_with_friction
 from dln_jax.mechanics import lagrangian
 from dln_jax.mechanics.friction.laws import USUAL
 from dln_jax.scenes.datasets.generators import characters

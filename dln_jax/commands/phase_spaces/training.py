@@ -13,8 +13,7 @@ import numpy as np
 from dln_jax.commands.phase_spaces.data import ANCHOR, PhaseLog, spreads
 from dln_jax.data.schema import Trajectories, column
 from dln_jax.data.splits import PER_SAMPLE, hold_out
-from dln_jax.learning.context import Context
-from dln_jax.learning.engine.checkpoint import identity
+from dln_jax.learning.engine.checkpoint import Context, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser
 from dln_jax.learning.engine.problem import Problem, Progress, Training, losses, one_after_the_other

@@ -14,13 +14,13 @@ from dln_jax.data.log import Log
 from dln_jax.data.parts import Parts
 from dln_jax.data.splits import Split
 from dln_jax.learning import dynamics
-from dln_jax.learning.context import Context
+from dln_jax.learning.dynamics import without_offset
+from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.learning.engine.fit import fit as train
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import one_after_the_other
 from dln_jax.learning.fit import Fit, direct_fit, fit_of
 from dln_jax.learning.fits.settings import Goal, Kernel, Trigonometric
-from dln_jax.learning.gauges import without_offset
 from dln_jax.learning.kernel import choose_kernel, fit_kernel
 from dln_jax.learning.linear import choose_degrees, fit_linear
 from dln_jax.learning.objectives import (
@@ -156,7 +156,7 @@ def refine(start: Fit, parts: Parts, context: Context) -> Fit:
         return start
     precision = start.description["precision"]
     suited, reason = dynamics.suited_optimiser(start.model, parts.sets, start.objective)
-    if suited is not GaussNewton or precision != "f64":
+    if suited != "gauss-newton" or precision != "f64":
         why = reason if precision == "f64" else "the precision is f32"
         raise InputError(f"--objective refines a {start.name} model by Gauss-Newton in f64, but {why}; leave it out")
     problem = dynamics.problem(start.model, parts.sets, start.objective)._replace(parameters=start.parameters)

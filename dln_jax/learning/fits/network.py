@@ -12,18 +12,16 @@ from dln_jax.data.parts import Parts
 from dln_jax.data.splits import Split, drawn, merged
 from dln_jax.data.splits import select as trajectories
 from dln_jax.learning import dynamics
-from dln_jax.learning.context import Context
-from dln_jax.learning.dynamics import MANY_JOINTS, suited_network
+from dln_jax.learning.dynamics import MANY_JOINTS, suited_network, summed_with_friction, without_offset
+from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.learning.engine.fit import fit as train
 from dln_jax.learning.engine.optimisers import Optimiser, name_of, optimiser_named
 from dln_jax.learning.engine.problem import Problem, Training, losses
 from dln_jax.learning.fit import Fit, fit_of
 from dln_jax.learning.fits.settings import OF_ADAM, Network
-from dln_jax.learning.gauges import summed_with_friction, without_offset
 from dln_jax.learning.latency import latency_of
 from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, Objective, objective_of
-from dln_jax.learning.select import Trial, lowest, select
-from dln_jax.learning.selection import say_selection
+from dln_jax.learning.select import Trial, lowest, say_selection, select
 from dln_jax.scale.devices import device_lines
 from dln_jax.scale.mesh import of_first_process
 from dln_jax.sizes import require_network
@@ -115,8 +113,7 @@ def plan_network(settings: Network, log: Log, parts: Parts, seed: int) -> Plan:
     description = describe_for(name, sets.train, needs, precision=precision, **size)
     reason = "" if suited is None else suited.reason
     if optimizer == "auto":
-        kind, reason = dynamics.suited_optimiser(build(description), sets, objective)
-        optimizer = name_of(kind)
+        optimizer, reason = dynamics.suited_optimiser(build(description), sets, objective)
         description["precision"] = precision = settings.precision or ("f32" if optimizer == "adam" else "f64")
     steps, samples = settings.steps, settings.samples
     if suited is not None:

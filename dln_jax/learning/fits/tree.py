@@ -3,7 +3,7 @@
 from dln_jax.data.log import Log
 from dln_jax.data.parts import Parts
 from dln_jax.files import read_json
-from dln_jax.learning.context import Context
+from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.learning.fit import Fit, direct_fit
 from dln_jax.learning.fits.direct import goal_of, refine
 from dln_jax.learning.fits.settings import Arm, LearnedTree
