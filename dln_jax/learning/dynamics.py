@@ -38,8 +38,6 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split
 from dln_jax.learning import objectives
 from dln_jax.learning.engine import optimisers
-from dln_jax.learning.engine.checkpoint import identity
-from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Problem
 from dln_jax.learning.objectives import TORQUE, Objective
 from dln_jax.learning.uncertainty import effective_samples
@@ -89,18 +87,6 @@ def problem(model: Model, sets: Split, objective: Objective = TORQUE, *, seeds: 
     numbers = jnp.asarray(seeds)
     initial = jax.jit(lambda seeds: jax.lax.map(lambda seed: model.init(jax.random.key(seed)), seeds))
     return Problem(residual, initial(numbers), fitted, score, numbers)
-
-
-def samples(model: Model, sets: Split, objective: Objective = TORQUE) -> tuple[Array, ...]:
-    """All arrays that are read for fitting, selecting and monitoring, in the model's precision."""
-    return tuple(map(lambda *parts: jnp.concatenate(parts), *_read(model, sets, objective)[1]))
-
-
-def identity_of(
-    optimiser: Optimiser, sets: Split, objective: Objective = TORQUE, *, seeds: int | Sequence[int] = 0
-) -> dict[str, Any]:
-    """Returns the identity of a training, for `Checkpoint`."""
-    return identity(optimiser, (getattr(data, key) for data in sets for key in objective.keys), seeds=seeds)
 
 
 def validation_errors(

@@ -72,9 +72,13 @@ class Context(NamedTuple):
         """The context of a fit that has at most these seconds."""
         return self._replace(until=min(self.until, time.perf_counter() + seconds))
 
-    def checkpoint(self, identity: dict[str, Any], name: str = CHECKPOINT) -> Checkpoint | None:
+    def checkpoint(
+        self, name: str, optimiser: Optimiser, arrays: Iterable[np.ndarray | Array | None], **settings: Any
+    ) -> Checkpoint | None:
         """Where a training with this identity is stored; `None` without a folder."""
-        return None if self.folder is None else Checkpoint(self.folder, identity, self.resume, name)
+        if self.folder is None:
+            return None
+        return Checkpoint(self.folder, identity(optimiser, arrays, **settings), self.resume, name)
 
 
 def identity(optimiser: Optimiser, arrays: Iterable[np.ndarray | Array | None], **settings: Any) -> dict[str, Any]:

@@ -6,6 +6,7 @@ of torques, Gauss-Newton refines the result.
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,8 @@ from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.learning.engine.fit import fit as train
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import one_after_the_other
-from dln_jax.learning.fit import Fit, direct_fit, fit_of
-from dln_jax.learning.fits.settings import Goal, Kernel, Trigonometric
+from dln_jax.learning.fit import Fit, direct_fit
+from dln_jax.learning.fits.settings import Kernel, LearnedTree, Trigonometric
 from dln_jax.learning.kernel import choose_kernel, fit_kernel
 from dln_jax.learning.linear import choose_degrees, fit_linear
 from dln_jax.learning.objectives import (
@@ -46,29 +47,25 @@ EXACT = 1e-12
 
 def fit_basis(settings: Trigonometric, log: Log, parts: Parts, context: Context) -> Fit:
     """Fits the trigonometric model by least squares; without a stated degree, validation chooses the degrees first."""
-    began, sets, say = time.perf_counter(), parts.sets, context.say
-    for line in device_lines(settings.precision or "f64"):
-        say(line)
+    began, train, say = time.perf_counter(), parts.sets.train, context.say
     degree: Any = 1 if settings.degree is None else settings.degree
-    description = describe_for(
-        settings.model, sets.train, log.needs, precision=settings.precision or "f64", degree=degree
-    )
+    description = described(settings, log.needs, parts, context, degree=degree)
     if settings.degree is None:
-        chosen, trials = choose_degrees(log.needs, sets.train, sets.validation)
+        chosen, trials = choose_degrees(log.needs, train, parts.sets.validation)
         tried = ", ".join(f"{_degrees(trial.candidate)}: {trial.validation:.2e}" for trial in trials)
         say(f"validation error by degrees of the joints: {tried}; chosen {_degrees(chosen.candidate)}")
         description["degree"] = list(chosen.candidate)
         solution = chosen.outcome
     else:
-        solution = fit_linear(build(description), sets.train)
+        solution = fit_linear(build(description), train)
     description, needs, solution = choose_offset(
-        description, log.needs, sets, solution, lambda lean: fit_linear(build(lean), sets.train), say
+        description, log.needs, parts, solution, lambda lean: fit_linear(build(lean), train), say
     )
     size = f"{solution.parameter_count} parameters, rank {solution.rank}, condition {solution.condition:.3g}"
     say(f"least squares: {size}")
     how = {"loss": solution.torque_mse, "seconds": time.perf_counter() - began}
-    start = direct_fit(description, needs, parts, solution.parameters, goal_of(settings, sets), **how)
-    return refine(start, parts, context)
+    objective = goal_of(settings, parts.sets)
+    return refine(direct_fit(description, needs, parts, solution.parameters, objective, **how), parts, context)
 
 
 def _degrees(degrees: tuple[int, ...]) -> str:
@@ -77,49 +74,51 @@ def _degrees(degrees: tuple[int, ...]) -> str:
 
 def fit_energies(settings: Kernel, log: Log, parts: Parts, context: Context) -> Fit:
     """Fits two kernels, with and without the assumption of a serial chain, and selects one by validation."""
-    began, sets, say = time.perf_counter(), parts.sets, context.say
-    for line in device_lines(settings.precision or "f64"):
-        say(line)
+    began, train, say = time.perf_counter(), parts.sets.train, context.say
     samples = SAMPLES if settings.samples is None else settings.samples
     require_positive(samples=samples)
-    chosen, trials = choose_kernel(log.needs, sets.train, sets.validation, samples=samples)
-    order, count = chosen.candidate, chosen.outcome.samples
-    description = describe_for(
-        settings.model, sets.train, log.needs, precision=settings.precision or "f64", samples=count, serial=order
-    )
+    chosen, trials = choose_kernel(log.needs, train, parts.sets.validation, samples=samples)
+    kept = {"samples": chosen.outcome.samples, "serial": chosen.candidate}
     description, needs, solution = choose_offset(
-        description,
+        described(settings, log.needs, parts, context, **kept),
         log.needs,
-        sets,
+        parts,
         chosen.outcome,
-        lambda lean: fit_kernel(without_offset(log.needs), sets.train, samples=count, serial=order),
+        lambda lean: fit_kernel(without_offset(log.needs), train, **kept),
         say,
     )
-    if solution.samples < len(sets.train.tau):
-        say(f"kernel: {solution.samples} of {len(sets.train.tau)} samples, evenly spaced; --samples takes more")
-    tried = ", ".join(f"{_order(trial.candidate)}: {trial.validation:.2e}" for trial in trials)
+    if solution.samples < len(train.tau):
+        say(f"kernel: {solution.samples} of {len(train.tau)} samples, evenly spaced; --samples takes more")
+    order = {True: "a chain", False: "any order"}
+    tried = ", ".join(f"{order[trial.candidate]}: {trial.validation:.2e}" for trial in trials)
     say(f"validation error in units of the torques' variance by order of the bodies: {tried}")
     noise = ", ".join(f"{sd:.2g}" for sd in solution.noise)
     size = f"{solution.parameter_count} equations, log likelihood {solution.likelihood:.2f} by the torque"
-    say(f"kernel: {_order(order)}, {size}, noise of the joints {noise}")
-    loss, seconds = solution.torque_mse, time.perf_counter() - began
-    return direct_fit(description, needs, parts, solution.parameters, SCALED_TORQUE, loss=loss, seconds=seconds)
+    say(f"kernel: {order[chosen.candidate]}, {size}, noise of the joints {noise}")
+    how = {"loss": solution.torque_mse, "seconds": time.perf_counter() - began}
+    return direct_fit(description, needs, parts, solution.parameters, **how)
 
 
-def _order(serial: bool) -> str:
-    return "a chain" if serial else "any order"
+def described(
+    settings: Trigonometric | Kernel | LearnedTree, needs: Needs, parts: Parts, context: Context, **keywords: Any
+) -> Description:
+    """Describes the model, in float64 unless stated otherwise, and says on which devices it is fitted."""
+    precision = settings.precision or "f64"
+    for line in device_lines(precision):
+        context.say(line)
+    return describe_for(settings.model, parts.sets.train, needs, precision=precision, **keywords)
 
 
-def goal_of(settings: Goal, sets: Split) -> Objective:
+def goal_of(settings: Trigonometric | LearnedTree, sets: Split) -> Objective:
     """The objective of the settings; torques count in units of their spread."""
-    objective = objective_of(getattr(settings, "model"), sets.train, settings.objective)  # noqa: B009
+    objective = objective_of(settings.model, sets.train, settings.objective)
     return SCALED_TORQUE if objective is TORQUE else objective
 
 
 def choose_offset(
     description: Description,
     needs: Needs,
-    sets: Split,
+    parts: Parts,
     solution: Any,
     refit: Callable[[Description], Any],
     say: Callable[[str], None],
@@ -133,13 +132,13 @@ def choose_offset(
     lean = without_offset(needs)
     if lean == needs:
         return description, needs, solution
-    scale = np.asarray(torque_scale(sets.train))
+    scale, validation = np.asarray(torque_scale(parts.sets.train)), parts.sets.validation
 
     def fitted(needs_of_trial: Needs) -> tuple[Any, np.ndarray]:
         own = {**description, "needs": needs_of_trial._asdict()}
         result = refit(own) if needs_of_trial == lean else solution
-        errors = squared_torque_errors(build(own), result.parameters, sets.validation, scale)
-        return (own, needs_of_trial, result), mean_of_segments(sets.validation, errors).mean(axis=1)
+        errors = squared_torque_errors(build(own), result.parameters, validation, scale)
+        return (own, needs_of_trial, result), mean_of_segments(validation, errors).mean(axis=1)
 
     chosen, _ = select((lean, needs), fitted, stop=lambda trial: trial.validation <= EXACT)
     say(f"friction kept by validation: {', '.join(chosen.candidate.joint_friction) or 'none'}")
@@ -162,8 +161,8 @@ def refine(start: Fit, parts: Parts, context: Context) -> Fit:
     problem = dynamics.problem(start.model, parts.sets, start.objective)._replace(parameters=start.parameters)
     refit = train(problem, GaussNewton(steps=REFINEMENTS, improvement=1e-6), seconds=context.seconds, must_start=False)
     before = start.training
-    history = one_after_the_other([before.history, refit.history])
     context.say(f"refined by both sides' errors: validation {before.validation:.2e}, after it {refit.validation:.2e}")
-    better = np.isfinite(refit.validation) and refit.validation < before.validation
-    training = (refit if better else before)._replace(history=history, compile_seconds=refit.compile_seconds)
-    return fit_of(start.description, start.needs, training, objective=start.objective, search=start.search)
+    training = refit if np.isfinite(refit.validation) and refit.validation < before.validation else before
+    history = one_after_the_other([before.history, refit.history])
+    training = training._replace(history=history, compile_seconds=refit.compile_seconds)
+    return replace(start, training=training, parameters=training.parameters)

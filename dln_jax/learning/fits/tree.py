@@ -5,15 +5,13 @@ from dln_jax.data.parts import Parts
 from dln_jax.files import read_json
 from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.learning.fit import Fit, direct_fit
-from dln_jax.learning.fits.direct import goal_of, refine
+from dln_jax.learning.fits.direct import described, goal_of, refine
 from dln_jax.learning.fits.settings import Arm, LearnedTree
 from dln_jax.learning.kinematics.fit import fit_tree
 from dln_jax.learning.kinematics.frames import KinematicPrior, kinematic_prior_from_json
 from dln_jax.learning.kinematics.search import Search
 from dln_jax.mechanics.friction.laws import USUAL
-from dln_jax.scale.devices import device_lines
 from dln_jax.types import InputError, Needs
-from dln_jax.zoo.descriptions import describe_for
 
 
 def fit(settings: LearnedTree, log: Log, parts: Parts, context: Context) -> Fit:
@@ -21,17 +19,7 @@ def fit(settings: LearnedTree, log: Log, parts: Parts, context: Context) -> Fit:
     needs = needs_of_tree(log.needs)
     parents = parents_of(settings, needs.degrees_of_freedom)
     prior = kinematic_prior_of(settings, needs.degrees_of_freedom, parents)
-    precision = settings.precision or "f64"
-    for line in device_lines(precision):
-        context.say(line)
-    description = describe_for(
-        settings.model,
-        parts.sets.train,
-        needs,
-        precision=precision,
-        parents=parents,
-        velocity_scale=needs.velocity_scale,
-    )
+    description = described(settings, needs, parts, context, parents=parents, velocity_scale=needs.velocity_scale)
     solution = fit_tree(
         needs,
         parts.sets.train,
