@@ -52,13 +52,6 @@ def torque_scale(data: Trajectories) -> Float[Array, " d"]:
     return _scale("tau", data.tau, message)
 
 
-def require_scales(data: Trajectories) -> None:
-    """Raises `InputError` if no model can be fitted to the torques: they do not vary, or numbers are far too large."""
-    for key in ("q", "qd", "qdd"):
-        spread(key, getattr(data, key))
-    torque_scale(data)
-
-
 TORQUE = Objective(
     keys=("q", "qd", "qdd", "tau"),
     scale=torque_scale,

@@ -33,8 +33,8 @@ class Trial(NamedTuple):
     candidate: Any
     outcome: Any
     """The fit, or the reason why there is none."""
-    errors: Float[np.ndarray, " N"] | None
-    """Squared error of every validation sample; `None` without a fit."""
+    errors: Any
+    """[N] squared error of every validation sample; `None` without a fit."""
 
     @property
     def validation(self) -> float:
@@ -54,13 +54,6 @@ def significantly_better(
     return bool(gain.mean() > margin * standard_error)
 
 
-def betters(trial: Trial, other: Trial) -> bool:
-    """Whether a trial has a fit whose errors are significantly lower than those of another, which has one too."""
-    if trial.errors is None or other.errors is None:
-        return False
-    return significantly_better(trial.errors, other.errors)
-
-
 def lowest(trials: Sequence[Trial]) -> Trial:
     """Returns the trial with the lowest validation error."""
     return min(trials, key=lambda trial: trial.validation)
@@ -69,7 +62,7 @@ def lowest(trials: Sequence[Trial]) -> Trial:
 def simplest(trials: Sequence[Trial]) -> Trial:
     """Returns the first trial whose error no other betters significantly."""
     best = lowest(trials)
-    return next(trial for trial in trials if not betters(best, trial))
+    return next(trial for trial in trials if not significantly_better(best.errors, trial.errors))
 
 
 def select(

@@ -16,6 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from dln_jax.data.arrays import spread
 from dln_jax.data.encoders.sampling import noise_of
 from dln_jax.data.log import Log
 from dln_jax.data.parts import Parts
@@ -31,7 +32,7 @@ from dln_jax.learning.fit import Fit, direct_fit
 from dln_jax.learning.fits.settings import Automatic, Kernel, LearnedTree, Network, Trigonometric
 from dln_jax.learning.fits.tree import needs_of_tree, with_joint_laws
 from dln_jax.learning.linear import MOST_PARAMETERS, parameters_of_degree
-from dln_jax.learning.objectives import require_scales, squared_torque_errors, torque_scale
+from dln_jax.learning.objectives import squared_torque_errors, torque_scale
 from dln_jax.learning.select import Trial, lowest, mean_of_segments, say_selection, select, simplest
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction.laws import USUAL
@@ -66,9 +67,10 @@ def fit(settings: Automatic, log: Log, parts: Parts, context: Context) -> Fit:
         InputError: no model could be fitted.
     """
     train, validation, _ = parts.sets
-    require_scales(train)
+    for key in ("q", "qd", "qdd"):
+        spread(key, getattr(train, key))  # refuses numbers that are far too large
+    torque_scale(train)
     log = log._replace(needs=with_joint_laws(log.needs))
-    noise = noise_of(train.tau, train.trajectory)
     limited = math.isfinite(context.until)
     context = context if limited else context.within(SELECTION_SECONDS)
 
@@ -87,7 +89,7 @@ def fit(settings: Automatic, log: Log, parts: Parts, context: Context) -> Fit:
         {name: bound(name, candidate) for name, candidate in candidates_of(settings, log)},
         train,
         validation,
-        noise=noise if np.isfinite(noise).all() and noise.all() else None,
+        noise=noise_of(train.tau, train.trajectory),
         until=context.until,
         definite=lambda result: is_definite(result, parts),
         beside=beside,
@@ -102,7 +104,7 @@ def compare(
     train: Trajectories,
     validation: Trajectories,
     *,
-    noise: Float[np.ndarray, " d"] | None = None,
+    noise: Float[np.ndarray, " d"] | float = math.nan,
     until: float = math.inf,
     definite: Callable[[Any], bool] = lambda result: True,
     beside: Callable[[Any], tuple[str, Callable[[], Any]] | None] = lambda result: None,
@@ -117,7 +119,7 @@ def compare(
             structured first.
         train: samples that they are fitted to; the variances of their torques are the units of the errors.
         validation: other motions.
-        noise: standard deviation of the joints' torque noise, N m or N, if known; the comparison ends at such errors.
+        noise: standard deviation of the joints' torque noise, N m or N, or NaN; the comparison ends at such errors.
         until: reading of `time.perf_counter` after which no further candidate is tried, once one is fitted.
         definite: whether a model's mass matrix is positive definite; true for models without one.
         beside: chosen model -> one more candidate made of it, tried unless the comparison has ended.
@@ -127,12 +129,11 @@ def compare(
         InputError: torques that do not vary, or no candidate that could be fitted.
     """
     scale, rows, ended = np.asarray(torque_scale(train)), {}, ""
-    share = None if noise is None else (noise / scale) ** 2
-    every_candidate = dict(candidates)
+    share = (noise / scale) ** 2
 
-    def attempt(name: str) -> tuple[Any, np.ndarray | None]:
+    def attempt(name: str, candidate: Callable[[], Any]) -> tuple[Any, np.ndarray | None]:
         began = time.perf_counter()
-        result = every_candidate[name]()
+        result = candidate()
         seconds, errors = time.perf_counter() - began, None
         if not isinstance(result, str):
             squares = squared_torque_errors(result.model, result.parameters, validation, scale)
@@ -161,7 +162,7 @@ def compare(
             return False
         if (nmse <= EXACT).all():
             ended = f"{trial.candidate} is exact"
-        elif share is not None and np.all((nmse >= LEAST_NOISE * share) & (nmse <= MOST_NOISE * share)):
+        elif np.all((nmse >= LEAST_NOISE * share) & (nmse <= MOST_NOISE * share)):
             ended = f"the errors of {trial.candidate} are the noise of the torques"
         return bool(ended)
 
@@ -170,13 +171,14 @@ def compare(
         sound = [trial for trial in trials if rows[trial.candidate]["definite"] and trial.validation <= affordable]
         return simplest(sound or trials)
 
-    chosen, trials = select(list(candidates), attempt, rule=rule, until=until, stop=stop)
+    chosen, trials = select(
+        list(candidates), lambda name: attempt(name, candidates[name]), rule=rule, until=until, stop=stop
+    )
     left = list(candidates)[len(trials) :]
     if left and not ended:
         ended = f"time is out; not tried: {', '.join(left)}"
     if not ended and (more := beside(chosen.outcome)) is not None:
-        every_candidate.update([more])
-        trial = Trial(more[0], *attempt(more[0]))
+        trial = Trial(more[0], *attempt(*more))
         chosen = rule([chosen, trial]) if trial.errors is not None else chosen
     return chosen, list(rows.values()), ended
 
