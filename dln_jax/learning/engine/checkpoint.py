@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 
 from dln_jax.files import finite, is_file
 from dln_jax.learning.engine.optimisers import Optimiser
-from dln_jax.learning.engine.problem import Progress
+from dln_jax.learning.engine.problem import Progress, plain
 from dln_jax.time_limit import seconds_left
 from dln_jax.types import InputError
 from dln_jax.zoo import parameter_files as checkpoints
@@ -82,18 +82,10 @@ class Context(NamedTuple):
 
 
 def identity(optimiser: Optimiser, arrays: Iterable[np.ndarray | Array | None], **settings: Any) -> dict[str, Any]:
-    """Returns the identity of a run: optimiser, data fingerprint, settings, but not the time limit, which may grow."""
+    """Returns the identity of a run: optimiser, settings and the SHA-256 of its arrays; a time limit may grow."""
     stated = {"optimiser": type(optimiser).__name__, **optimiser._asdict(), **settings}
-    return {"settings": stated, "data": fingerprint(arrays)}
-
-
-def fingerprint(arrays: Iterable[np.ndarray | Array | None]) -> str:
-    """Returns the SHA-256 of a run's arrays; a resumed run uses it to recognise its data."""
-    digest = hashlib.sha256()
-    for array in arrays:
-        if array is not None:
-            digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+    data = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays if array is not None)
+    return {"settings": stated, "data": hashlib.sha256(data).hexdigest()}
 
 
 def store(checkpoint: Checkpoint, state: Any, history: list[Progress]) -> None:
@@ -122,7 +114,11 @@ def restore(checkpoint: Checkpoint | None, like: Any) -> tuple[Any, list[Progres
             )
     state = checkpoints.load_tree(checkpoint.directory, checkpoint.name, like)
     path = checkpoint.directory / f"{checkpoint.name}.json"
-    return state, [Progress(*map(_number, row)) for row in stored_rows(path, manifest, "history", Row)]
+    rows = stored_rows(path, manifest, "history", Row)
+    return state, [
+        Progress._make([plain(step), *(plain(np.array(value, float)) for value in values), seconds, stage])
+        for step, *values, seconds, stage in rows
+    ]
 
 
 def stored_rows(path: Path, manifest: dict[str, Any], key: str, row: Any) -> list[Any]:
@@ -146,9 +142,3 @@ def stored_rows(path: Path, manifest: dict[str, Any], key: str, row: Any) -> lis
 def has_checkpoint(directory: Path, name: str = CHECKPOINT) -> bool:
     """Whether this folder holds a checkpoint of a run."""
     return is_file(directory / f"{name}.json")
-
-
-def _number(value: Any) -> Any:
-    if isinstance(value, list):
-        return np.array([_number(element) for element in value])
-    return math.nan if value is None else value

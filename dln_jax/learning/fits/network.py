@@ -87,21 +87,19 @@ def plan_network(settings: Network, log: Log, parts: Parts, context: Context) ->
     # A structured model needs fewer units; first-order training needs more.
     size: dict[str, Any] = {"width": 64 if adam else 8 if properties.definite else 16, "depth": 2, "activation": "tanh"}
     size |= {key: value for key in size if (value := getattr(settings, key)) is not None}
-    size |= {} if suited is None else suited.keywords
+    size |= suited.keywords if suited else {}
     require_network(width=size["width"], depth=size["depth"])
     precision = settings.precision or ("f32" if adam else "f64")
     description = describe_for(name, sets.train, needs, precision=precision, **size)
     if optimizer == "auto":
         optimizer, reason = dynamics.suited_optimiser(build(description), sets, objective)
         description["precision"] = precision = settings.precision or ("f32" if optimizer == "adam" else "f64")
-    steps, samples = settings.steps, settings.samples
-    if suited is not None:
-        steps = suited.steps if steps is None else steps
-        samples = suited.samples if samples is None else samples
-    elif optimizer == "gauss-newton" and not properties.definite:
-        steps = steps or WITHOUT_STRUCTURE
-    chosen = {key: getattr(settings, key) for key in (*OF_ADAM, "target")}
-    optimiser = optimiser_named(optimizer, precision=precision, steps=steps, **chosen)
+    chosen = {key: getattr(settings, key) for key in (*OF_ADAM, "target", "steps")}
+    if settings.steps is None and suited:
+        chosen["steps"] = suited.steps
+    elif settings.steps is None and not properties.definite and optimizer == "gauss-newton":
+        chosen["steps"] = WITHOUT_STRUCTURE
+    optimiser = optimiser_named(optimizer, precision=precision, **chosen)
     if needs != log.needs:
         context.say("friction has no offset: the potential takes any constant")
     if properties.canonical and objective.of_torques:
@@ -116,7 +114,7 @@ def plan_network(settings: Network, log: Log, parts: Parts, context: Context) ->
         needs=needs,
         objective=objective,
         optimiser=optimiser,
-        samples=samples,
+        samples=suited.samples if suited and settings.samples is None else settings.samples,
         seeds=context.seed if settings.seeds == 1 else tuple(range(context.seed, context.seed + settings.seeds)),
     )
 
