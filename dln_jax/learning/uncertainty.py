@@ -141,7 +141,7 @@ def estimate(
     _, chosen, fit, noise, inflation = min(map(calibrated, RIDGES if ridge is None else (ridge,)), key=lambda of: of[0])
     limits = unit * np.concatenate([np.linalg.norm(part @ fit.along, axis=2) for part in (fitted, judged)])
     factor, scale = (known.directions @ fit.along) / known.scale[:, None], known.scale
-    undetermined = known.directions[:, known.sizes == 0] if chosen == 0 else np.zeros((len(scale), 0))
+    undetermined = known.directions[:, (known.sizes == 0) & (chosen == 0)]
     if basis is not None:
         factor, scale, undetermined = basis @ factor, np.ones(len(basis)), np.zeros((len(basis), 0))
     limit = np.maximum(margin * np.quantile(limits, quantile, axis=0), TINY)
@@ -172,9 +172,8 @@ def calibration(
     relative = np.maximum(noise**2 + ratios * variance, TINY)
     factors = np.maximum(np.mean(residual**2 / relative, axis=1), TINY)
     both = 0.5 + 0.5 * (np.log(factors) + np.mean(np.log(relative), axis=1))
-    one = int(np.argmin(abs(ratios - 1)))
-    best = int(np.argmin(both))
-    unscaled = 0.5 * float(np.mean(residual**2 / relative[one] + np.log(relative[one])))
+    one, best = RATIOS.index(1.0), int(np.argmin(both))
+    unscaled = both[one] + 0.5 * (factors[one] - 1 - np.log(factors[one]))
     further = 0.5 * np.log(max(samples, 2.0)) / max(samples, 1.0)
     candidates = [
         (unscaled, unscaled, 1.0, 1.0),

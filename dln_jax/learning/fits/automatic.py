@@ -29,8 +29,8 @@ from dln_jax.identification.identify import identify, parameters_of
 from dln_jax.identification.rigid_tree import build_rigid_tree, describe_rigid_tree
 from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.learning.fit import Fit, direct_fit
+from dln_jax.learning.fits.direct import needs_of_tree, with_joint_laws
 from dln_jax.learning.fits.settings import Automatic, Kernel, LearnedTree, Network, Trigonometric
-from dln_jax.learning.fits.tree import needs_of_tree, with_joint_laws
 from dln_jax.learning.linear import MOST_PARAMETERS, parameters_of_degree
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
 from dln_jax.learning.select import Trial, lowest, mean_of_segments, say_selection, select, simplest

@@ -132,7 +132,7 @@ class LearnedTree(Arm, Goal):
 
     model: str = "learned-tree"
 
-    FITTED_BY = "tree.fit"
+    FITTED_BY = "direct.fit_arm"
 
 
 @dataclass(frozen=True)
