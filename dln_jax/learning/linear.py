@@ -157,9 +157,8 @@ def design_chunks(
     length = -(-samples // -(-samples // chunk_size)) if even else chunk_size
     for first in range(0, samples, length):
         # The last chunk is padded with its first sample, so that one program serves all chunks.
-        rows = np.arange(first, first + length)
-        rows[rows >= samples] = first
         last = min(first + length, samples)
+        rows = np.append(np.arange(first, last), np.full(first + length - last, first))
         columns, tau = linearise(parameters, data.q[rows], data.qd[rows], data.qdd[rows])
         yield np.asarray(columns)[: last - first], np.asarray(tau)[: last - first], data.tau[first:last]
 

@@ -91,21 +91,15 @@ def _both_scales(data: Trajectories) -> Float[Array, " two_d"]:
     return jnp.concatenate([torque_scale(data), _scale("qdd", data.qdd, still)])
 
 
-FORWARD = Objective(
-    keys=("q", "qd", "qdd", "tau"),
+FORWARD = SCALED_TORQUE._replace(
     scale=lambda data: _both_scales(data)[data.degrees_of_freedom :],
     residual=lambda system, q, qd, qdd, tau: dynamics(system).forward_dynamics(q, qd, tau) - qdd,
-    selects_by="scaled",
 )
 """qdd_hat(q, qd, tau) - qdd."""
 
-BOTH_WAYS = Objective(
-    keys=("q", "qd", "qdd", "tau"),
+BOTH_WAYS = SCALED_TORQUE._replace(
     scale=_both_scales,
-    residual=lambda system, q, qd, qdd, tau: jnp.concatenate(
-        [dynamics(system).inverse_dynamics(q, qd, qdd) - tau, dynamics(system).forward_dynamics(q, qd, tau) - qdd]
-    ),
-    selects_by="scaled",
+    residual=lambda *sample: jnp.concatenate([TORQUE.residual(*sample), FORWARD.residual(*sample)]),
 )
 """[tau_hat - tau, qdd_hat - qdd], in units of their standard deviations in the training samples: the loss of Lutter
 and Peters (2021, arXiv:2110.01894). It also serves models whose inverse and forward sides are different networks."""

@@ -93,10 +93,8 @@ def select(
         trial = Trial(candidate, *fit(candidate))
         trials.append(trial)
         if trial.errors is not None:
-            if best is None or significantly_better(trial.errors, best):
-                best, waited = trial.errors, 0
-            else:
-                waited += 1
+            better = best is None or significantly_better(trial.errors, best)
+            best, waited = (trial.errors, 0) if better else (best, waited + 1)
             if waited >= patience or stop(trial):
                 break
         if best is not None and time.perf_counter() >= until:

@@ -134,7 +134,7 @@ def stored_rows(path: Path, manifest: dict[str, Any], key: str, row: Any) -> lis
         rows = msgspec.convert(manifest.get(key), list[row])
     except msgspec.ValidationError as error:
         raise InputError(f"{path}: {key} is damaged ({error}); {checkpoints.REMEDY}") from error
-    if any([np.shape(value) for value in values] != [np.shape(value) for value in rows[0]] for values in rows):
+    if len({tuple(map(np.shape, values)) for values in rows}) > 1:
         raise InputError(f"{path}: {key} has rows of different shapes; {checkpoints.REMEDY}")
     return rows
 
