@@ -30,7 +30,7 @@ from dln_jax.learning.engine.problem import (
     Progress,
     ProgressReport,
     Training,
-    mean_square,
+    loss_of,
     selected_by,
     silent,
     unmonitored,
@@ -76,9 +76,7 @@ Targets = tuple[Array | None, ...]
 """x, y, dy and d2y of `FunctionSamples`; arrays that the loss does not read are `None` and never computed."""
 
 
-def published_adam(
-    samples: int, *, epochs: int = 500, batch: int = 512, learning_rate: float = 1e-3, weight_decay: float = 1e-6
-) -> Adam:
+def published_adam(samples: int, *, epochs: int = 500, batch: int = 512, learning_rate: float = 1e-3) -> Adam:
     """Returns the published recipe for this number of samples: a constant rate and no early stopping."""
     require_positive(epochs=epochs, batch=batch)
     steps = epochs * (samples // min(batch, samples))
@@ -86,7 +84,7 @@ def published_adam(
         steps=steps,
         batch=batch,
         learning_rate=learning_rate,
-        weight_decay=weight_decay,
+        weight_decay=1e-6,
         patience=steps,
         second_moment_decay=0.999,
         warm_up_share=0,
@@ -138,18 +136,17 @@ def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
         jax.random.key(network.seed), sizes, members=network.members, dtype=data_type(network.precision)
     )
     of_sample = functools.partial(residual, activation=activation(network.activation))
+    members = selected_by(theirs, of_sample, layers, ours, jnp.full(network.members, network.seed))
     if not together:
-        return selected_by(theirs, of_sample, layers, ours, jnp.full(network.members, network.seed))
-
-    def of_member(layers: Layers, batch: Targets) -> Scalar:
-        return mean_square(functools.partial(of_sample, layers), batch)
+        return members
+    loss = loss_of(members)
 
     def total(layers: Layers, batch: Targets) -> Scalar:
         """The sum of losses leaves every member's gradient, and so its training, the same as alone."""
         if network.members == 1:
             # An axis of one member would turn all products into batched ones, at two or three times the cost.
-            return of_member(jax.tree.map(lambda leaf: leaf[0], layers), batch)
-        return jax.vmap(lambda member: of_member(member, batch))(layers).sum()
+            return loss(jax.tree.map(lambda leaf: leaf[0], layers), batch)
+        return jax.vmap(loss, (0, None))(layers, batch).sum()
 
     def score(layers: Layers) -> tuple[Scalar, Scalar]:
         return unmonitored(total(layers, theirs) / network.members)

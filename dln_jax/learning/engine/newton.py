@@ -55,13 +55,8 @@ def stages(problem: Problem, optimiser: GaussNewton, shared: Sharing) -> list[St
     # The normal equations, their factor and a copy, in float64.
     require_memory(f"Gauss-Newton's equations for {count:,} parameters", 24.0 * seeds * count**2)
     arrays = jax.tree.map(jnp.asarray, problem.arrays)
-    iterate = functools.partial(
-        levenberg_marquardt.run_on_chunks,
-        problem.residual,
-        improvement=optimiser.improvement,
-        mesh=shared.samples,
-    )
-
+    settings = {"improvement": optimiser.improvement, "mesh": shared.samples}
+    iterate = functools.partial(levenberg_marquardt.run_on_chunks, problem.residual, **settings)
     stage = functools.partial(_stage, problem, optimiser, shared, iterate)
     if not optimiser.has_coarse_stage(len(arrays[0])):
         return [stage("", arrays, optimiser.steps)]

@@ -9,6 +9,7 @@ noise of the torques, or rounding, and when time is up. A residual network is tr
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -72,21 +73,17 @@ def fit(settings: Automatic, log: Log, parts: Parts, context: Context) -> Fit:
     torque_scale(train)
     log = log._replace(needs=with_joint_laws(log.needs))
     limited = math.isfinite(context.until)
-    context = context if limited else context.within(SELECTION_SECONDS)
-
-    def bound(name: str, candidate: Candidate) -> Callable[[], Fit | str]:
-        return lambda: fit_or_load(
-            name, candidate, log, parts, context if limited else context.within(CANDIDATE_SECONDS)
-        )
+    context = context.within(math.inf if limited else SELECTION_SECONDS)
+    attempt = partial(fit_or_load, log, parts, context, math.inf if limited else CANDIDATE_SECONDS)
 
     def beside(base: Fit) -> tuple[str, Callable[[], Fit | str]] | None:
         if not (base.properties.linear or base.properties.searched):
             return None
         name = base.name + BESIDE
-        return name, bound(name, lambda *given: with_network(base, *given))
+        return name, partial(attempt, name, partial(with_network, base))
 
     chosen, rows, ended = compare(
-        {name: bound(name, candidate) for name, candidate in candidates_of(settings, log)},
+        {name: partial(attempt, name, candidate) for name, candidate in candidates_of(settings, log)},
         train,
         validation,
         noise=noise_of(train.tau, train.trajectory),
@@ -204,7 +201,7 @@ def candidates_of(settings: Automatic, log: Log) -> list[tuple[str, Candidate]]:
     ]
 
 
-def fit_or_load(name: str, candidate: Candidate, log: Log, parts: Parts, context: Context) -> Fit | str:
+def fit_or_load(log: Log, parts: Parts, context: Context, seconds: float, name: str, candidate: Candidate) -> Fit | str:
     """Fits a candidate and stores it in a folder of its own, or takes it from there if the run is resumed.
 
     A learned tree is fitted again: its verdict needs the search.
@@ -220,7 +217,7 @@ def fit_or_load(name: str, candidate: Candidate, log: Log, parts: Parts, context
         return direct_fit(run.description, needs, parts, run.parameters, seconds=float(facts["seconds"]))
     began = time.perf_counter()
     try:
-        result = candidate(log, parts, context)
+        result = candidate(log, parts, context.within(seconds))
     except InputError as error:
         result = str(error)
     if context.folder is None:

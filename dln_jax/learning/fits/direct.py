@@ -178,8 +178,7 @@ def refine(start: Fit, parts: Parts, context: Context) -> Fit:
 def fit_arm(settings: LearnedTree, log: Log, parts: Parts, context: Context) -> Fit:
     """Searches joint frames by Gauss-Newton, from random starts or near a prior, and eliminates everything else."""
     needs = needs_of_tree(log.needs)
-    parents = parents_of(settings, needs.degrees_of_freedom)
-    prior = kinematic_prior_of(settings, needs.degrees_of_freedom, parents)
+    parents, prior = knowledge_of(settings, needs.degrees_of_freedom)
     description = described(settings, needs, parts, context, parents=parents, velocity_scale=needs.velocity_scale)
     solution = fit_tree(
         needs,
@@ -217,28 +216,22 @@ def with_joint_laws(needs: Needs) -> Needs:
     return needs._replace(friction=False, joint_friction=needs.joint_friction or USUAL)
 
 
-def parents_of(settings: Arm, d: int) -> tuple[int, ...] | None:
-    """The stated parents of the joints, counted from 0, as everywhere else in the code."""
-    if settings.parents is None:
-        return None
-    try:
-        parents = tuple(int(number) - 1 for number in settings.parents.split(","))
-    except ValueError:
-        parents = ()
-    if len(parents) != d or any(not -1 <= parent < link for link, parent in enumerate(parents)):
-        raise InputError(
-            f"--parents is {settings.parents!r:.60}; expected {d} whole numbers separated by commas: joints before, "
-            "counted from 1, or 0 for the ground"
-        )
-    return parents
-
-
-def kinematic_prior_of(settings: Arm, d: int, parents: tuple[int, ...] | None) -> KinematicPrior | None:
-    """Reads the stated kinematic prior."""
-    path = settings.kinematic_prior
+def knowledge_of(settings: Arm, d: int) -> tuple[tuple[int, ...] | None, KinematicPrior | None]:
+    """The stated parents of d joints, counted from 0 as everywhere else in the code, and the stated kinematic prior."""
+    parents, path = None, settings.kinematic_prior
+    if settings.parents is not None:
+        try:
+            parents = tuple(int(number) - 1 for number in settings.parents.split(","))
+        except ValueError:
+            parents = ()
+        if len(parents) != d or any(not -1 <= parent < link for link, parent in enumerate(parents)):
+            raise InputError(
+                f"--parents is {settings.parents!r:.60}; expected {d} whole numbers separated by commas: joints "
+                "before, counted from 1, or 0 for the ground"
+            )
     if path is None:
-        return None
+        return parents, None
     try:
-        return kinematic_prior_from_json(read_json(path, remedy="see --help"), d, parents)
+        return parents, kinematic_prior_from_json(read_json(path, remedy="see --help"), d, parents)
     except InputError as error:
         raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
