@@ -6,6 +6,7 @@ With J D⁻¹ = U S Vᵀ, torque noise of variance noise_i², and a prior of var
 
     Cov(D theta) = V (S² + ridge)⁻¹ (S Uᵀ Sigma U S + ridge Sigma) (S² + ridge)⁻¹ Vᵀ,   Sigma = diag(noise_i² / unit_i²)
 
+Here torques are in the joints' units `unit_i`, so that J and r need no scale, and noise_i is relative to unit_i.
 For ridge = 0 this is the covariance of weighted least squares on the determined directions, for any weights. If all
 joints have the same Sigma it is Laplace's approximation, Sigma (JᵀJ + ridge D²)⁻¹. The degrees of freedom of joint i
 are the trace of the hat matrix over its rows:  noise_i² = sum r_i² / (N - dof_i).

@@ -109,19 +109,20 @@ def estimate(
             raise InputError("the parameters are not finite; train again")
         held_out, some = (thin(data, MOST_SAMPLES) for data in (validation, train))
 
-        def rows(data: Trajectories, basis: np.ndarray | None = None) -> Rows:
+        basis: np.ndarray | None = None
+
+        def rows(data: Trajectories) -> Rows:
             for columns, tau, measured in design_chunks(design(model), parameters, data, CHUNK, even=False):
                 columns = columns / unit[:, None]
                 yield columns if basis is None else columns @ basis, (tau - measured) / unit
 
-        basis = None
         if ridge != 0 and count(parameters) > MOST_PARAMETERS:
             basis = leading_directions(lambda: rows(some), DIRECTIONS)
-        known = spectrum(rows(train, basis), negligible=negligible)
+        known = spectrum(rows(train), negligible=negligible)
 
         def along(data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
             """Phi D⁻¹ V [N, d, P] and the residuals [N, d] of some data."""
-            columns, residuals = map(np.concatenate, zip(*rows(data, basis), strict=True))
+            columns, residuals = map(np.concatenate, zip(*rows(data), strict=True))
             return columns / known.scale @ known.directions, residuals
 
         (fitted, _), (judged, residual) = along(some), along(held_out)
@@ -149,9 +150,8 @@ def estimate(
     states, others = (np.concatenate([data.q, data.qd, data.qdd], axis=1) for data in (train, validation))
     centre = (states.max(axis=0) + states.min(axis=0)) / 2
     reach = np.quantile(abs(np.concatenate([states, others]) - centre), quantile, axis=0)
-    domain = Domain(
-        np.maximum(limit, harmless), scale, undetermined, centre, np.maximum(margin * reach, STILL), harmless
-    )
+    reach = np.maximum(margin * reach, STILL)
+    domain = Domain(np.maximum(limit, harmless), scale, undetermined, centre, reach, harmless)
     return Estimate(
         Uncertainty(factor, unit * noise, inflation, domain), chosen, fit.degrees_of_freedom, unit * fit.noise
     )

@@ -43,7 +43,8 @@ def fit(settings: Network, log: Log, parts: Parts, context: Context) -> Fit:
     Raises:
         InputError: settings out of range, data that cannot determine the model, or a loss that is not finite.
     """
-    plan, quiet = plan_network(settings, log, parts, context), context._replace(progress=no_progress)
+    plan = plan_network(settings, log, parts, context)
+    quiet = context._replace(progress=no_progress)
     if settings.target is not None:
         return grow(settings.target, plan, parts, quiet)
     several = settings.seeds > 1 and settings.folds > 1
@@ -71,7 +72,8 @@ def plan_network(settings: Network, log: Log, parts: Parts, context: Context) ->
     Says what it chose.
     """
     require_consistent(settings, context.seed)
-    name, sets, needs, optimizer, reason = settings.model, parts.sets, log.needs, settings.optimizer, ""
+    name, optimizer, reason = settings.model, settings.optimizer, ""
+    sets, needs = parts.sets, log.needs
     if summed_with_friction(needs, sets.train, network=True):
         needs = without_offset(needs)
     objective = objective_of(name, sets.train, settings.objective)
