@@ -108,23 +108,23 @@ STATED = {"inverse": TORQUE, "forward": FORWARD, "both": BOTH_WAYS}
 """Objectives that a user may select by name."""
 
 
-def objective_of(name: str, data: Trajectories, stated: str | None = None) -> Objective:
+def objective_of(name: str, data: Trajectories, stated: str | None = None, *, torque: Objective = TORQUE) -> Objective:
     """Returns the objective of a model of the catalogue; a Hamiltonian needs momenta, and otherwise fits torques.
 
     Args:
         stated: name from `STATED` that overrides the model's own objective.
+        torque: takes the place of `TORQUE`.
 
     Raises:
         InputError: only one side is selected for a model without an energy, whose other side would not be trained.
     """
     properties = CATALOGUE[name].properties
-    if stated is not None:
-        if not properties.energy and stated != "both":
-            raise InputError(f"a {name} model has no energy, so both of its sides are trained; leave --objective out")
-        return STATED[stated]
-    objective = CANONICAL if properties.canonical else TORQUE if properties.energy else BOTH_WAYS
-    complete = all(getattr(data, key) is not None for key in objective.keys)
-    return objective if complete else TORQUE
+    if stated not in (None, "both") and not properties.energy:
+        raise InputError(f"a {name} model has no energy, so both of its sides are trained; leave --objective out")
+    own = CANONICAL if properties.canonical else TORQUE if properties.energy else BOTH_WAYS
+    complete = all(getattr(data, key) is not None for key in own.keys)
+    objective = STATED[stated] if stated is not None else own if complete else TORQUE
+    return torque if objective is TORQUE else objective
 
 
 def arrays(objective: Objective, data: Trajectories, dtype: Any) -> tuple[Array, ...]:

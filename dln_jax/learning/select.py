@@ -47,9 +47,9 @@ def significantly_better(
     errors: Float[np.ndarray, " N"], others: Float[np.ndarray, " N"], *, margin: float = 1.0
 ) -> bool:
     """Whether `errors` are lower than `others` on average, by more than `margin` standard errors of the difference."""
-    if not np.isfinite(np.mean(errors)) or not np.isfinite(np.mean(others)):
-        return bool(np.isfinite(np.mean(errors)))
     gain = others - errors
+    if not np.isfinite(gain.mean()):
+        return bool(np.isfinite(np.mean(errors)))
     standard_error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0
     return bool(gain.mean() > margin * standard_error)
 

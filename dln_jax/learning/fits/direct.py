@@ -15,7 +15,6 @@ import numpy as np
 
 from dln_jax.data.log import Log
 from dln_jax.data.parts import Parts
-from dln_jax.data.splits import Split
 from dln_jax.files import read_json
 from dln_jax.learning import dynamics
 from dln_jax.learning.dynamics import without_offset
@@ -32,8 +31,6 @@ from dln_jax.learning.kinematics.search import Search
 from dln_jax.learning.linear import choose_degrees, fit_linear
 from dln_jax.learning.objectives import (
     SCALED_TORQUE,
-    TORQUE,
-    Objective,
     objective_of,
     squared_torque_errors,
     torque_scale,
@@ -71,7 +68,7 @@ def fit_basis(settings: Trigonometric, log: Log, parts: Parts, context: Context)
     size = f"{solution.parameter_count} parameters, rank {solution.rank}, condition {solution.condition:.3g}"
     say(f"least squares: {size}")
     how = {"loss": solution.torque_mse, "seconds": time.perf_counter() - began}
-    objective = goal_of(settings, parts.sets)
+    objective = objective_of(settings.model, parts.sets.train, settings.objective, torque=SCALED_TORQUE)
     return refine(direct_fit(description, needs, parts, solution.parameters, objective, **how), parts, context)
 
 
@@ -114,12 +111,6 @@ def described(
     for line in device_lines(precision):
         context.say(line)
     return describe_for(settings.model, parts.sets.train, needs, precision=precision, **keywords)
-
-
-def goal_of(settings: Trigonometric | LearnedTree, sets: Split) -> Objective:
-    """The objective of the settings; torques count in units of their spread."""
-    objective = objective_of(settings.model, sets.train, settings.objective)
-    return SCALED_TORQUE if objective is TORQUE else objective
 
 
 def choose_offset(
@@ -184,16 +175,14 @@ def fit_arm(settings: LearnedTree, log: Log, parts: Parts, context: Context) -> 
         needs,
         parts.sets.train,
         parts.sets.validation,
-        parents=description["parents"],
-        acceleration=description["acceleration"],
-        velocity_scale=description["velocity_scale"],
+        **{key: description[key] for key in ("parents", "acceleration", "velocity_scale")},
         settings=Search(seed=context.seed, seconds=context.seconds, kinematic_prior=prior),
         report=context.say,
     )
     size = f"{solution.parameter_count} parameters, of the linear ones rank {solution.rank}, "
     context.say(f"learned tree: {size}condition {solution.condition:.3g}")
     how = {"loss": solution.torque_mse, "seconds": solution.seconds, "search": solution}
-    objective = goal_of(settings, parts.sets)
+    objective = objective_of(settings.model, parts.sets.train, settings.objective, torque=SCALED_TORQUE)
     return refine(direct_fit(description, needs, parts, solution.parameters, objective, **how), parts, context)
 
 

@@ -76,9 +76,8 @@ def plan_network(settings: Network, log: Log, parts: Parts, context: Context) ->
     sets, needs = parts.sets, log.needs
     if summed_with_friction(needs, sets.train, network=True):
         needs = without_offset(needs)
-    objective = objective_of(name, sets.train, settings.objective)
-    if objective is TORQUE and settings.target is None:
-        objective = SCALED_TORQUE
+    torque = SCALED_TORQUE if settings.target is None else TORQUE
+    objective = objective_of(name, sets.train, settings.objective, torque=torque)
     properties = CATALOGUE[name].properties
     sized = settings.width is not None or settings.depth is not None or settings.target is not None
     suited = None
