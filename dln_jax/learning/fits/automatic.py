@@ -101,11 +101,11 @@ def compare(
     train: Trajectories,
     validation: Trajectories,
     *,
-    noise: Float[np.ndarray, " d"] | float = math.nan,
-    until: float = math.inf,
-    definite: Callable[[Any], bool] = lambda result: True,
-    beside: Callable[[Any], tuple[str, Callable[[], Any]] | None] = lambda result: None,
-    say: Callable[[str], None] = lambda line: None,
+    noise: Float[np.ndarray, " d"] | float,
+    until: float,
+    definite: Callable[[Any], bool],
+    beside: Callable[[Any], tuple[str, Callable[[], Any]] | None],
+    say: Callable[[str], None],
 ) -> tuple[Trial, list[dict[str, Any]], str]:
     """Fits candidates in order; chooses the first that no other betters significantly, definite ones before others.
 
