@@ -118,9 +118,9 @@ def segments(data: Trajectories, seconds: float = SEGMENT) -> Int[np.ndarray, " 
 def mean_of_segments(data: Trajectories, errors: Float[np.ndarray, "N ..."]) -> Float[np.ndarray, "S ..."]:
     """Means of samples' errors over their time segments."""
     numbers = segments(data)
-    counts = np.bincount(numbers)
-    means = [np.bincount(numbers, column) / counts for column in errors.reshape(len(errors), -1).T]
-    return np.stack(means, axis=1).reshape(len(counts), *errors.shape[1:])
+    sums = np.zeros((numbers.max() + 1, *errors.shape[1:]))
+    np.add.at(sums, numbers, errors)
+    return (sums.T / np.bincount(numbers)).T
 
 
 def say_selection(context: Context, title: str, kept: str, ended: str, rows: Sequence[dict[str, Any]]) -> None:
