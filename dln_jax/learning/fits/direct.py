@@ -160,7 +160,7 @@ def refine(start: Fit, parts: Parts, context: Context) -> Fit:
     refit = train(problem, GaussNewton(steps=REFINEMENTS, improvement=1e-6), seconds=context.seconds, must_start=False)
     before = start.training
     context.say(f"refined by both sides' errors: validation {before.validation:.2e}, after it {refit.validation:.2e}")
-    training = refit if np.isfinite(refit.validation) and refit.validation < before.validation else before
+    training = refit if refit.validation < before.validation else before
     history = one_after_the_other([before.history, refit.history])
     training = training._replace(history=history, compile_seconds=refit.compile_seconds)
     return replace(start, training=training, parameters=training.parameters)
