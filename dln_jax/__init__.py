@@ -9,8 +9,7 @@ import importlib
 import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
-import dln_jax.interrupts
-import dln_jax.time_limit  # noqa: F401  first, as its import starts the clock
+import dln_jax.process  # noqa: F401  first: an interrupt of the imports prints one word
 
 if TYPE_CHECKING:
     from dln_jax.public import *  # noqa: F403

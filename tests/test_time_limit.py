@@ -11,9 +11,9 @@ from dln_jax.commands import train_delan
 from dln_jax.data import schema
 from dln_jax.learning.engine.problem import Progress, Stop, Training
 from dln_jax.learning.fits import network
+from dln_jax.process import SOON, counting_from, deadline, seconds_left
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import chain
-from dln_jax.time_limit import SOON, counting_from, deadline, seconds_left
 from tests.calls import command
 
 

@@ -1,10 +1,9 @@
 """Train a model of dynamics on trajectories (q, qd, qdd, tau), and report its errors, its rollouts and its speed.
 
 Models: structured-delan (a deep Lagrangian network, M = L Lᵀ), black-box-delan (a network is the Lagrangian),
-trigonometric (linear in its parameters), trigonometric-kernel (the same energies as a Gaussian process), learned-tree
-(bodies and joint frames of an arm), feed-forward (no physics), and auto, the default for --data: model selection by
-validation motions. Each model has options of its own: --model NAME --help shows them. Without --data the embedded set
-is used: the tip of a two-link arm writes 20 letters. Load the run with dln_jax.load.
+trigonometric (linear in its parameters), trigonometric-kernel (the same as a Gaussian process), learned-tree (an arm's
+bodies and joint frames), feed-forward (no physics), auto (model selection). --model NAME --help shows the options of a
+model. Without --data, a two-link arm writes 20 letters. Load the run with dln_jax.load.
 """
 
 import dataclasses
@@ -32,8 +31,7 @@ ModelName = Annotated[
         "auto",
     ],
     tyro.conf.arg(
-        help="Model to learn; auto: validation chooses among several models (default: auto for --data, "
-        "structured-delan for the embedded letters and scenes).",
+        help="Model to learn (default: auto with --data, else structured-delan).",
         help_behavior_hint="",
     ),
 ]
@@ -44,17 +42,17 @@ class Plant(Drawn, Resumable, Filtered):
     """Data and what they show, and where the results go."""
 
     data: Unstated[Path] = None
-    """Trajectories, npz, CSV or ROS bag (default: the embedded letters, or states of --scene)."""
+    """Trajectories: npz, CSV, bag (default: letters or --scene)."""
     test: Unstated[str] = None
-    """Test trajectories: comma-separated labels; last:30% for the end of every trajectory; or blocks, for ten blocks of
-    time in each (default: e,q,v, else every sixth, else blocks of time)."""
+    """Test trajectories: labels, comma separated; last:30% of every trajectory; or ten blocks of time in each (default:
+    e,q,v, else every sixth, else blocks)."""
     scene: Unstated[SceneName] = None
-    """Textbook scene that states the needs of the data, such as cart-pole or chain-3; sampled if there is no --data."""
+    """Textbook scene that states the needs, such as chain-3; sampled without data."""
     needs: Unstated[str] = None
-    """Joints and terms of the plant, such as '{"joints": ["revolute"], "friction": true}' (default: those of the scene
-    or file, else revolute joints, gravity and friction)."""
+    """Joints and terms, such as '{"joints": ["revolute"], "friction": true}' (default: the scene's or file's, else
+    revolute, gravity, friction)."""
     seed: int = 0
-    """Seed of parameters, shuffling and validation split."""
+    """Seed of parameters, shuffling and validation."""
     uncertainty: bool = True
     """Estimate the uncertainty of the torques, and flag states out of distribution."""
 
@@ -158,12 +156,12 @@ def train(options: Options, command: str) -> None:
     from dln_jax.data.parts import split_log
     from dln_jax.learning.engine.checkpoint import Context
     from dln_jax.learning.fit import with_uncertainty
+    from dln_jax.process import deadline
     from dln_jax.runs.evaluation import evaluate
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import finish
     from dln_jax.runs.scaled import mesh_of
     from dln_jax.runs.stored_arguments import command_folder
-    from dln_jax.time_limit import deadline
     from dln_jax.types import require_positive
 
     seconds = getattr(options, "seconds", None)

@@ -95,7 +95,7 @@ def main(options: Arguments) -> None:
     from dln_jax.runs.report import Report, cost_metrics, finish, number, png, unit_of
     from dln_jax.runs.scaled import mesh_of
     from dln_jax.runs.stored_arguments import command_folder
-    from dln_jax.scale.devices import device_lines
+    from dln_jax.scale import device_lines
     from dln_jax.types import require_seed
     from dln_jax.zoo.descriptions import describe
     from dln_jax.zoo.run import load as load_run

@@ -184,12 +184,12 @@ def main(options: Options) -> None:
     from dln_jax.commands.phase_spaces.training import POLYNOMIAL, train
     from dln_jax.learning.engine.checkpoint import Context
     from dln_jax.learning.engine.optimisers import optimiser_named
+    from dln_jax.process import deadline
     from dln_jax.runs.arguments import require_positive_if_given
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import finish
     from dln_jax.runs.scaled import mesh_of
     from dln_jax.runs.stored_arguments import command_folder
-    from dln_jax.time_limit import deadline
     from dln_jax.types import require_seed
     from dln_jax.zoo.run import save
 
@@ -254,7 +254,7 @@ def lines_on(log: "PhaseLog", description: dict[str, Any]) -> Iterator[str]:
     import numpy as np
 
     from dln_jax.commands.phase_spaces.training import gauge_of, in_velocities
-    from dln_jax.scale.devices import device_lines
+    from dln_jax.scale import device_lines
 
     data, needs = log.fitted, description["needs"]
     terms = " and ".join(name for name in ("gravity", "friction") if needs[name]) or "no potential"

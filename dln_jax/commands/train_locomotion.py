@@ -77,8 +77,7 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
     from dln_jax.runs.report import Report, finish, png
     from dln_jax.runs.scaled import mesh_of
     from dln_jax.runs.stored_arguments import command_folder
-    from dln_jax.scale.devices import device_lines
-    from dln_jax.scale.mesh import shares
+    from dln_jax.scale import device_lines, shares
     from dln_jax.softbody.terms.creature import TIME_STEP
     from dln_jax.types import require_positive, require_seed
     from dln_jax.zoo.parameter_files import save_tree

@@ -1,27 +1,18 @@
-"""Writes and reads the files of an export as a unit, and never overwrites a run.
+"""Writes the files of an export as a unit, and never overwrites a run.
 
-A description, a JSON file beside the others, holds the SHA-256 of all files and of itself. All new files are complete
-before the first is renamed into place, and descriptions come last. After an interruption there are the old files, the
-new files, or a description with wrong digests, which readers refuse. Digests detect accidents, not forgery.
+A description, a JSON file beside the others, holds the SHA-256 of each. All new files are complete before the first is
+renamed into place, and descriptions come last: after an interruption there are the old files, the new files, or files
+that differ from their digests, which `interface.read_interface` refuses. Digests detect accidents, not forgery.
 """
 
-import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
 from dln_jax.files import read_json, writing
 from dln_jax.types import InputError
-
-AGAIN = "export it again"
-
-
-def described(facts: Mapping[str, Any], files: Mapping[str, bytes]) -> bytes:
-    """Returns the JSON description of files (name -> bytes): the facts and the digests."""
-    values = {**facts, "files": {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}}
-    return json.dumps({**values, "sha256": _digest(values)}, indent=2).encode() + b"\n"
 
 
 def write_exports(directory: Path, files: Mapping[str, bytes], *, overwrite: bool) -> list[Path]:
@@ -59,37 +50,8 @@ def write_exports(directory: Path, files: Mapping[str, bytes], *, overwrite: boo
     return [directory / name for name in files]
 
 
-def read_export(path: Path, names: Iterable[str]) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """Returns the facts of a description, and the bytes of the named files beside it.
-
-    Raises:
-        InputError: a file is missing, unreadable or altered.
-    """
-    values = read_json(path, remedy=f"{AGAIN}, and keep its files together")
-    stated, digests = values.pop("sha256", None), values.get("files")
-    if stated is None or not isinstance(digests, dict):
-        raise InputError(f"{path}: describes no export, or one of an older release; {AGAIN}")
-    if stated != _digest(values):
-        raise InputError(f"{path}: truncated or altered (its SHA-256 is not the one in it); {AGAIN}")
-    del values["files"]
-    files = {}
-    for name in names:
-        file = path.with_name(name)
-        try:
-            files[name] = file.read_bytes()
-        except OSError as error:
-            raise InputError(f"{file}: cannot be read ({error.strerror}); {AGAIN}") from error
-        if hashlib.sha256(files[name]).hexdigest() != digests.get(name):
-            raise InputError(f"{file}: truncated or altered (its SHA-256 is not {path.name}'s); {AGAIN}")
-    return values, files
-
-
 def _values(path: Path) -> dict[str, Any]:
     """Returns the object in a JSON file, or an empty dictionary."""
     with suppress(InputError):
         return read_json(path, remedy="")
     return {}
-
-
-def _digest(values: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

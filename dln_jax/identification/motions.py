@@ -27,7 +27,6 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.identification.consistent import fit_consistent
 from dln_jax.identification.equations import Columns
@@ -35,6 +34,7 @@ from dln_jax.learning.linear import unravelled
 from dln_jax.learning.shooting import MeasuredWindows, cut_measured_windows, motion, without_start
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model
+from dln_jax.precision import quick_compilation
 from dln_jax.solvers.least_squares import triangular_factor
 from dln_jax.types import InputError, require_positive
 

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import every
@@ -22,6 +21,7 @@ from dln_jax.mechanics.trees.description import Tree, tree_to_json
 from dln_jax.mechanics.trees.motors import Pair
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.trees import Rows
+from dln_jax.precision import quick_compilation
 from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import Description, build, describe
 

@@ -20,7 +20,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import BLOCKS, every, in_blocks
 from dln_jax.learning.engine.problem import arrays_of
@@ -33,6 +32,7 @@ from dln_jax.mechanics.trees.motors import Pair, motor_regressor, require_motors
 from dln_jax.mechanics.trees.recursions import regressor
 from dln_jax.models.model import Model
 from dln_jax.models.trees import WARM, RigidTreeParameters, Rows, make_rigid_tree
+from dln_jax.precision import quick_compilation
 from dln_jax.solvers.separable import SeparableSolution, solve_separable
 from dln_jax.types import FrictionLaw, InputError
 

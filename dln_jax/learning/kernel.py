@@ -23,7 +23,6 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
 from dln_jax.learning.select import Trial
@@ -31,6 +30,7 @@ from dln_jax.mechanics.friction.curves import unit_force
 from dln_jax.mechanics.friction.laws import FrictionShape, coefficients_of
 from dln_jax.models.joint_friction import FrictionParameters
 from dln_jax.models.kernel import KernelParameters, KernelScales, States, torque_covariance
+from dln_jax.precision import quick_compilation
 from dln_jax.types import InputError, JointKind, Needs, require_positive
 from dln_jax.zoo.catalogue import CATALOGUE
 

@@ -23,11 +23,11 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
 from dln_jax.learning.select import Trial, select, significantly_better
 from dln_jax.models.model import Model, Parameters, linearised
+from dln_jax.precision import quick_compilation
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
 from dln_jax.types import InputError, Needs, require_positive

@@ -21,11 +21,11 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.learning.engine.problem import better_of, mean_square, no_best
 from dln_jax.learning.linear import design, unravelled
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
+from dln_jax.precision import quick_compilation
 from dln_jax.solvers import least_squares, levenberg_marquardt
 from dln_jax.types import InputError, require_positive
 

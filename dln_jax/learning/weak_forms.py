@@ -33,7 +33,6 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float, Int
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders.sampling import EVEN, delay_held, held_at_equal_steps
 from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import Trajectories
@@ -46,6 +45,7 @@ from dln_jax.learning.objectives import torque_scale
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
+from dln_jax.precision import quick_compilation
 from dln_jax.solvers import least_squares
 from dln_jax.types import FrictionLaw, InputError, Needs, Vector, require_positive
 from dln_jax.zoo.descriptions import Description, build, describe

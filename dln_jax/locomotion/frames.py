@@ -6,7 +6,6 @@
 Observations in such a frame do not change if the body is moved or turned.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -28,12 +27,6 @@ def fitted_frame(vertices: Float[np.ndarray, "n dim"]) -> Frame:
     count, dimension = vertices.shape
     offsets = vertices - vertices.mean(axis=0)
     return Frame(np.full(count, 1 / count), np.linalg.pinv(offsets)[: dimension - 1])
-
-
-def vertex_frame(count: int, vertices: Sequence[int]) -> Frame:
-    """Frame of the published creatures: the first vertex is the origin, and the axes point to the others."""
-    one_hot = np.eye(count)[np.asarray(vertices)]
-    return Frame(one_hot[0], one_hot[1:] - one_hot[0])
 
 
 def axes_of(frame: Frame, x: Float[Array, "n dim"]) -> Float[Array, "dim dim"]:

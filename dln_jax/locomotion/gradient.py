@@ -44,7 +44,7 @@ from dln_jax.locomotion.learning import (
 )
 from dln_jax.locomotion.task import EpisodeState, LocomotionTask, Walk, advance, beginning, chosen, observe, walk
 from dln_jax.locomotion.value import Window, make_value, targets
-from dln_jax.scale.mesh import shares, spread
+from dln_jax.scale import shares, spread
 from dln_jax.types import InputError, require_positive
 
 Report = Callable[[int, Record], None]

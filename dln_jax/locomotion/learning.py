@@ -23,9 +23,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.files import finite as finite_values
-from dln_jax.interrupts import held_back
 from dln_jax.learning.engine.checkpoint import has_checkpoint, stored_rows
 from dln_jax.locomotion.task import (
     EpisodeState,
@@ -36,7 +34,9 @@ from dln_jax.locomotion.task import (
     observe,
     run_episode,
 )
-from dln_jax.scale.mesh import local, program, spread
+from dln_jax.precision import quick_compilation
+from dln_jax.process import held_back
+from dln_jax.scale import local, program, spread
 from dln_jax.sizes import require_network
 from dln_jax.types import InputError
 from dln_jax.zoo import parameter_files as checkpoints

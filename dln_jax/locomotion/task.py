@@ -88,6 +88,8 @@ class LocomotionTask(NamedTuple):
     variation: Variation
     clock_period: float
     """P in steps; 0 for no clock."""
+    dt: float = TIME_STEP
+    """Time step in s."""
 
     @property
     def observation_size(self) -> int:
@@ -139,6 +141,8 @@ class Walk(NamedTuple):
 def make_task(
     creature: Creature,
     *,
+    scene: SoftScene | None = None,
+    dt: float = TIME_STEP,
     episode: int = EPISODE,
     upright: float = UPRIGHT,
     speed: float = SPEED,
@@ -146,19 +150,33 @@ def make_task(
     frame: Frame | None = None,
     clock_period: float = CLOCK_PERIOD,
 ) -> LocomotionTask:
-    """Returns the task of a creature of the "creature" preset, with its published time step.
+    """Returns the task of a creature.
+
+    Args:
+        creature: its mesh and muscles, which the policy sees.
+        scene: a scene of this mesh with your own materials, contacts and actuators: a term "gravity", whose direction
+            slopes change, and one actuator with a control per muscle (default: the published creatures' material,
+            ground and muscles).
+        dt: time step, s (default: the published one).
 
     Raises:
-        InputError: the episode is not positive, or the variation is out of range.
+        InputError: a number is not positive, the variation is out of range, the scene is of another mesh or lacks
+            gravity, or rough ground is asked of a scene of your own.
     """
-    require_positive(episode=episode, clock_period=clock_period or 1.0)
+    require_positive(episode=episode, dt=dt, clock_period=clock_period or 1.0)
     require_variation(variation)
     length, vertices = body_length(creature), creature.mesh.vertices
     bumps = level_world(variation, vertices.shape[1]).bumps
-    scene = creature_scene(creature, bumps)
+    if scene is None:
+        scene = creature_scene(creature, bumps)
+    elif scene.mesh.vertices.shape != vertices.shape or "gravity" not in scene.params.terms or bumps is not None:
+        raise InputError(
+            "the scene does not suit the task; expected the creature's mesh, a term 'gravity', and no rough ground, "
+            "which only the published ground can be"
+        )
     frame = fitted_frame(vertices) if frame is None else frame
-    stepper = make_step(scene, TIME_STEP)
-    return LocomotionTask(creature, scene, stepper, frame, length, episode, upright, speed, variation, clock_period)
+    stepper = make_step(scene, dt)
+    return LocomotionTask(creature, scene, stepper, frame, length, episode, upright, speed, variation, clock_period, dt)
 
 
 def creature_named(name: str) -> Creature:

@@ -15,7 +15,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics import hamiltonian
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import Canonical, Driven, dynamics, hamiltonian_of
-from dln_jax.scale.mesh import spread
+from dln_jax.scale import spread
 from dln_jax.types import Hamiltonian, InputError
 
 DECOMPOSITION = ("inertial", "coriolis", "gravity")

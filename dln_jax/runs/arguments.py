@@ -1,6 +1,7 @@
 """Typed command lines: options that belong to a choice, help texts, and mistakes reported in one line."""
 
 import dataclasses
+import difflib
 import itertools
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -12,6 +13,7 @@ from tyro._errors import BadValue, InstantiationFailure, InvalidChoice, ParseErr
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from dln_jax.errors import InputError
+from dln_jax.runs.help import help_text
 from dln_jax.sizes import require_magnitude
 
 Arguments = TypeVar("Arguments")
@@ -91,7 +93,7 @@ def arguments_of(arguments: type, **stated: Any) -> Any:
 def parse(
     arguments: type, *, prog: str, description: str | None, line: Sequence[str], common: type | None = None
 ) -> Any:
-    """Parses a command line; `--help` prints the help and exits.
+    """Parses a command line; `--help` and `--help-all` print the help and exit.
 
     Args:
         prog: the command as the user typed it.
@@ -100,7 +102,11 @@ def parse(
     Raises:
         InputError: the line cannot be parsed.
     """
-    whole = arguments_for(arguments, _typed(line))
+    typed = _typed(line)
+    whole = arguments_for(arguments, typed)
+    if "help" in typed or "help_all" in typed or "-h" in line:
+        print(help_text(whole, prog=prog, description=description or "", common=common, every="help_all" in typed))
+        raise SystemExit(0)
 
     def refuse(event: ParseErrorEvent) -> None:
         raise InputError(f"{_complaint(event, arguments)} (see {prog} --help)")
@@ -149,7 +155,9 @@ def _unknown(option: str, arguments: type) -> str:
         for kind, words in known.items():
             if negated in {field.name for field in dataclasses.fields(kind)}:
                 return f"{option} is an option of {words}; add that, or leave {option} out"
-    return f"unrecognised option: {option:.80}"
+    names = [f"--{field.name.replace('_', '-')}" for kind in (arguments, *known) for field in dataclasses.fields(kind)]
+    like = difflib.get_close_matches(option, names, n=1)
+    return f"unrecognised option: {option:.80}" + (f"; did you mean {like[0]}?" if like else "")
 
 
 def names_listed(text: str | None) -> tuple[str, ...]:

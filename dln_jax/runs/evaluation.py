@@ -9,7 +9,6 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders.sampling import torque_noise
 from dln_jax.data.log import Log
 from dln_jax.data.parts import Parts
@@ -34,6 +33,7 @@ from dln_jax.metrics.motions import Motion, by_trajectory, metrics_of_motions, m
 from dln_jax.metrics.verdict import FAR_FROM_NOISE, HeldOut, Verdict, held_out, judge, verdict_metrics, worst
 from dln_jax.models.model import Model
 from dln_jax.models.uncertainty import Uncertainty, deviation_of_rows, exceeds, scores_of_rows
+from dln_jax.precision import quick_compilation
 from dln_jax.runs.report import Report, png
 from dln_jax.types import InputError
 

@@ -44,7 +44,7 @@ class Limited:
     """Time limit until the model is stored."""
 
     seconds: Unstated[float] = None
-    """Time until the model is stored, s, evaluation not counted (default: no limit)."""
+    """Time limit of the training, s (default: none)."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Devices:
     """Devices of one process that share the work."""
 
     devices: Unstated[int] = None
-    """Devices per process (default: 1, or all with several processes)."""
+    """Devices per process (default: 1; several processes: all)."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,7 @@ class Logged:
     units: Unstated[Literal["si", "degrees"]] = None
     """CSV: units of columns whose titles state none."""
     joints: Unstated[str] = None
-    """Joints to keep, in this order, or LOG=NAME to rename one, comma separated (default: all; names that differ from
-    the robot's by one prefix or ending are matched)."""
+    """Joints to keep, in this order; LOG=NAME renames one (default: all, also with a prefix or ending)."""
     topics: Unstated[str] = None
     """ROS bag: topics of joint states, comma separated (default: the only one)."""
     torque_factor: Unstated[str] = None
@@ -97,8 +96,8 @@ class Filtered(Checked):
     """How to derive rates where a log has no reliable ones."""
 
     cutoff: Unstated[str] = None
-    """Low-pass q at this frequency, Hz, auto, or inf for none, and derive the rates (default: the file's; auto where
-    it has none and the noise of q matters)."""
+    """Cut-off of the low-pass on q, Hz, from which rates follow; auto, or inf for none (default: the file's rates; auto
+    where it has none and q is noisy)."""
 
 
 @dataclass(frozen=True)

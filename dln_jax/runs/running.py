@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from dln_jax.errors import FitRefused, InputError, ProcessLost
+from dln_jax.process import counting_from
 from dln_jax.runs.arguments import parse
 from dln_jax.runs.options import CompilationCache, NoCompilationCache
 from dln_jax.sizes import require_magnitude, require_within
-from dln_jax.time_limit import IMPORTED, counting_from
 
 MOST_CHARACTERS = 400
 """Characters shown at either end of a long message; the middle is left out."""
@@ -31,7 +31,7 @@ def run(
     prog: str,
     line: Sequence[str] | None = None,
     description: str | None = None,
-    from_shell: bool = False,
+    began: float | None = None,
     joining: int | None = None,
 ) -> None:
     """Parses the command line and runs `main`; errors and exit statuses as for `as_one_line`.
@@ -40,9 +40,11 @@ def run(
         prog: the command as the user typed it.
         line: words after the command (default: those of this process).
         description: what the command does, for its help (default: the docstring of the module of `main`).
-        from_shell: whether the process runs only this command; compiled programs are then kept.
+        began: reading of `time.perf_counter` at the start of a process that runs only this command, whose compiled
+            programs are then kept and whose time limit counts from there (default: a call within a program).
         joining: seconds that several processes wait for each other to start (default: that of `scale.processes`).
     """
+    from_shell = began is not None
     with as_one_line(prog, None):
         common = NoCompilationCache if getattr(arguments, "MEASURES_COMPILATION", False) else CompilationCache
         description = description or sys.modules[main.__module__].__doc__
@@ -53,9 +55,9 @@ def run(
             sys.stdout.flush()  # the help; raises BrokenPipeError here if its reader has closed the pipe
         require_possible(whole.own)
         # JAX takes a second to import, which the help and a mistake do not need.
+        from dln_jax import scale
         from dln_jax.runs import compilation_cache, scaled
         from dln_jax.runs.stored_arguments import with_stored_arguments
-        from dln_jax.scale import processes
 
         # Data and references are float64; models state their own precision.
         compilation_cache.enable_double_precision()
@@ -64,10 +66,10 @@ def run(
         before = compilation_cache.compilation() if from_shell else None
         unkept = compilation_cache.keep(whole.common.compilation_cache) if from_shell else ""
 
-    began = IMPORTED if from_shell else time.perf_counter()
+    start = began if began is not None else time.perf_counter()
 
     def work(options: Any) -> None:
-        with as_one_line(prog, options), processes.losses_named(scaled.remedy_of(options)), counting_from(began):
+        with as_one_line(prog, options), scale.losses_named(scaled.remedy_of(options)), counting_from(start):
             main(options)
             if before and (text := compilation_cache.summary(before, unkept)):
                 print(text)
@@ -107,7 +109,7 @@ def as_one_line(prog: str, options: Any) -> Iterator[None]:
     except (RuntimeError, AssertionError) as error:
         if "RESOURCE_EXHAUSTED" in str(error):
             raise _refusal(f"out of memory ({str(error).splitlines()[0]:.200}); ask for less") from None
-        from dln_jax.scale.devices import unusable_platform
+        from dln_jax.scale import unusable_platform
 
         if (text := unusable_platform()) is None:
             raise

@@ -14,12 +14,10 @@ import jax
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
+from dln_jax import scale
 from dln_jax.files import PARTIAL
 from dln_jax.runs.options import Scaled
-from dln_jax.scale import processes
-from dln_jax.scale.devices import backend_started
-from dln_jax.scale.mesh import batch_mesh
-from dln_jax.scale.processes import Membership
+from dln_jax.scale import Membership, backend_started, batch_mesh
 from dln_jax.types import InputError
 
 SEEN_BY_USERS = ("figures",)
@@ -46,18 +44,18 @@ def membership_in(options: Any) -> Membership | None:
     """
     if not isinstance(options, Scaled):
         return None
-    processes.host_devices(options.devices)
-    member = processes.membership(options.processes, options.coordinator, options.process_id)
+    scale.host_devices(options.devices)
+    member = scale.membership(options.processes, options.coordinator, options.process_id)
     if member is not None and getattr(options, "out", None) is None:
         raise InputError("several processes share their run's folder; name one that all hosts see, by --out")
     return member
 
 
-def joined(member: Membership, options: Any, *, seconds: int = processes.JOINING) -> Any:
+def joined(member: Membership, options: Any, *, seconds: int = scale.JOINING) -> Any:
     """Joins the other processes of a command and returns the arguments of this one.
 
     Raises:
-        InputError: JAX has been used. Errors of `processes.join` end the process with one line and status 2.
+        InputError: JAX has been used. Errors of `scale.join` end the process with one line and status 2.
     """
     if backend_started():
         raise InputError("JAX has been used in this process; several are started before it is")
@@ -72,7 +70,7 @@ def joined(member: Membership, options: Any, *, seconds: int = processes.JOINING
     sys.stdout = open(os.dup(1), "w", buffering=1, errors=sys.stdout.errors)  # noqa: SIM115  open until the process ends
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     try:
-        processes.join(member, shared, seconds=seconds)
+        scale.join(member, shared, seconds=seconds)
     except (InputError, KeyboardInterrupt) as error:
         mistake = isinstance(error, InputError)
         print(f"error: {error}" if mistake else "interrupted", file=sys.stderr)

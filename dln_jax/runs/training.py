@@ -16,7 +16,7 @@ from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.learning.fit import Fit, with_uncertainty
 from dln_jax.learning.fits.settings import WAYS
 from dln_jax.precision import require_double_precision
-from dln_jax.time_limit import deadline
+from dln_jax.process import deadline
 from dln_jax.types import InputError
 from dln_jax.zoo.run import Run, load
 

@@ -17,9 +17,9 @@ import optimistix
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
-from dln_jax.compilation import quick_compilation
+from dln_jax.precision import quick_compilation
 from dln_jax.rollout import rollout
-from dln_jax.scale.mesh import local, program, spread
+from dln_jax.scale import local, program, spread
 from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.scene import Params, SoftScene
 from dln_jax.softbody.step import Stepper

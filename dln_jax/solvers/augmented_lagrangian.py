@@ -23,8 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.compilation import quick_compilation
-from dln_jax.precision import require_double_precision
+from dln_jax.precision import quick_compilation, require_double_precision
 from dln_jax.types import InputError, require_positive
 
 Constrained = Callable[..., tuple[Array, Array]]

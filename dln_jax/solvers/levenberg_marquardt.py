@@ -32,7 +32,7 @@ from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 
-from dln_jax.scale.mesh import first, on_devices, total
+from dln_jax.scale import first, on_devices, total
 from dln_jax.solvers import normal_equations as equations
 from dln_jax.solvers.normal_equations import Chunks, SampleResidual
 

@@ -18,7 +18,7 @@ from jax.scipy.linalg import solve_triangular
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from dln_jax.scale.mesh import total
+from dln_jax.scale import total
 from dln_jax.types import InputError
 
 SampleResidual = Callable[..., Array]

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.compilation import quick_compilation
+from dln_jax.precision import quick_compilation
 from dln_jax.solvers.least_squares import scaled_columns, truncated_svd
 from dln_jax.types import InputError, require_positive
 

@@ -25,6 +25,7 @@ STEPS = 60_000  # environment steps, at most
 # The task
 # --------
 # The creature has to go as far along x as it can within 400 steps, without a fall.
+# `make_task(creature, scene=..., dt=...)` takes a scene of your own: another material, contacts, pressure or tendons.
 
 task = make_task(creature_named("crawler"))
 print(f"{len(task.creature.mesh.vertices)} vertices, {task.muscle_count} muscles, body length {task.length:.2f} m")

@@ -30,6 +30,8 @@ from dln_jax.softbody.contact.crossings import crossings
 from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
 from dln_jax.softbody.driven import Example, drive, driven_step
 from dln_jax.softbody.mesh.mesh import lumped_masses, make_mesh, vertices_where
+from dln_jax.softbody.mesh.placement import join, translate
+from dln_jax.softbody.mesh.sets import values_by_set
 from dln_jax.softbody.mesh.shapes import disc, lattice
 from dln_jax.softbody.mesh.surfaces import enclosed_volume, inner_surface, surface_parts
 from dln_jax.softbody.scene import make_scene, potential
@@ -57,19 +59,13 @@ length = 6 * CHAMBERS + 4
 strip = [(i, j) for i in range(2) for j in range(length)]
 walls = [(i, j) for i in range(2, 8) for j in range(length - 4) if j % 6 in (0, 4) or (i == 7 and j % 6 < 4)]
 positions, triangles = lattice(strip + walls)
-right = CELL * positions + np.array([1.7 * RADIUS, DOWN + 8e-3])
-ball = disc(RADIUS, RINGS)
-parts = [(right, triangles), (right * np.array([-1.0, 1.0]), triangles), (ball.vertices, ball.elements)]
-parts[2][0][:, 1] += RADIUS + 4e-4
-starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-mesh = make_mesh(
-    np.concatenate([vertices for vertices, _ in parts]),
-    np.concatenate([start + elements for start, (_, elements) in zip(starts, parts, strict=False)]),
-)
-density = np.where(np.arange(len(mesh.elements)) < 2 * len(triangles), 1000.0, 200.0)  # kg/m³, silicone and foam
-masses = lumped_masses(mesh, density)
+positions = CELL * positions + np.array([1.7 * RADIUS, DOWN + 8e-3])
+right, left = (make_mesh(positions * [side, 1.0], triangles) for side in (1.0, -1.0))
+ball = translate(disc(RADIUS, RINGS), [0.0, RADIUS + 4e-4])
+mesh = join(right, left, ball=ball)
+masses = lumped_masses(mesh, values_by_set(mesh, 1000.0, {"ball": 200.0}))  # silicone and foam, kg/m³
 top = mesh.vertices[:, 1].max()
-roots, of_ball = vertices_where(mesh, lambda x: x[:, 1] > top - CELL / 2), np.arange(starts[2], starts[3])
+roots, of_ball = vertices_where(mesh, lambda x: x[:, 1] > top - CELL / 2), mesh.sets["ball"].vertices
 
 # %%
 # The scene
@@ -140,7 +136,7 @@ assert not any(crossings(mesh, x[k]) for k in shown)
 
 lifted = (x[-1] - x[0])[of_ball, 1].mean()
 forces = jax.jit(jax.grad(lambda x: potential(scene, x, scene.params, PRESSURE)))(x[-1])
-weight, own = 9.81 * masses[of_ball].sum(), 9.81 * masses[: starts[2]].sum()
+weight, own = 9.81 * masses[of_ball].sum(), 9.81 * np.delete(masses, of_ball).sum()
 carried = forces[roots, 1].sum() - own
 print(f"the ball was lifted by {1e3 * lifted:.1f} mm; it weighs {weight:.2f} N, and the palm carries {carried:.2f} N")
 assert UP < lifted < UP + 5e-3

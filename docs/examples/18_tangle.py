@@ -26,7 +26,7 @@ from dln_jax.rollout import rollout
 from dln_jax.softbody.contact.bodies import body_contact
 from dln_jax.softbody.contact.crossings import crossings
 from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
-from dln_jax.softbody.mesh.mesh import make_mesh
+from dln_jax.softbody.mesh.placement import join, rotate, translate
 from dln_jax.softbody.mesh.shapes import beam
 from dln_jax.softbody.scene import make_scene
 from dln_jax.softbody.step import make_step
@@ -47,14 +47,13 @@ DT, WIDTH = 0.01, 0.3  # s, m
 
 strip = beam(0.5, 0.02, 20, 1)
 random = np.random.default_rng(1)
-vertices, elements = [], []
-for k in range(STRIPS):
-    angle = np.pi / 2 + random.uniform(-0.05, 0.05)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    place = np.array([WIDTH * (k + 0.5) / STRIPS, 0.35 + 0.05 * k])
-    vertices.append((strip.vertices - strip.vertices.mean(axis=0)) @ turn.T + place)
-    elements.append(strip.elements + k * len(strip.vertices))
-mesh = make_mesh(np.concatenate(vertices), np.concatenate(elements))
+strip = translate(strip, -strip.vertices.mean(axis=0))
+mesh = join(
+    *(
+        translate(rotate(strip, np.pi / 2 + random.uniform(-0.05, 0.05)), [WIDTH * (k + 0.5) / STRIPS, 0.35 + 0.05 * k])
+        for k in range(STRIPS)
+    )
+)
 terms = [
     elastic(mesh, stable_neo_hookean, youngs_modulus=5e4, poisson_ratio=0.3),
     gravity(mesh),

@@ -94,7 +94,7 @@ def report(name: str) -> None:
         prog=sys.argv[0],
         line=words,
         description=module.__doc__,
-        from_shell=True,
+        began=time.perf_counter(),
     )
 
 

@@ -8,7 +8,6 @@ from scipy.spatial import ConvexHull, Delaunay
 
 from dln_jax.softbody.mesh.mesh import (
     boundary,
-    boundary_vertices,
     components,
     edges,
     lumped_masses,
@@ -83,7 +82,7 @@ def test_volume_boundary_and_centre():
 def test_vertices_of_a_beam_are_numbered_along_its_short_side():
     mesh = beam(4.0, 1.0, 40, 10)
     inside = ((mesh.vertices > 0) & (mesh.vertices < [4.0, 1.0])).all(axis=1)
-    assert_array_equal(boundary_vertices(mesh), np.flatnonzero(~inside))
+    assert_array_equal(np.unique(boundary(mesh)), np.flatnonzero(~inside))
     assert (len(mesh.vertices), len(mesh.elements)) == (451, 800)
     assert np.ptp(mesh.elements, axis=1).max() == 12  # a narrow band
     assert_array_equal(vertices_where(mesh, lambda x: x[:, 0] < 1e-9), np.arange(11))

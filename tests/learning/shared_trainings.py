@@ -20,7 +20,7 @@ from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
-from dln_jax.scale.mesh import batch_mesh, of_first_process, spread
+from dln_jax.scale import batch_mesh, of_first_process, spread
 from dln_jax.solvers import lapack
 from dln_jax.types import InputError
 

@@ -17,15 +17,21 @@ from dln_jax.commands import train_locomotion
 from dln_jax.figures.soft_bodies import write_soft_body_gif
 from dln_jax.locomotion import gradient
 from dln_jax.locomotion.environment import CreatureEnvironment
-from dln_jax.locomotion.frames import axes_of, fitted_frame, vertex_frame
+from dln_jax.locomotion.frames import Frame, axes_of, fitted_frame
 from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
 from dln_jax.locomotion.learning import Goal, Learned, Record, compile_learner, learn, make_policy
 from dln_jax.locomotion.task import FALLEN, Walk, advance, beginning, judged, make_task
 from dln_jax.locomotion.value import Window, targets
 from dln_jax.locomotion.worlds import Variation
-from dln_jax.scale.mesh import AXIS
+from dln_jax.scale import AXIS
+from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import Creature, lattice
+from dln_jax.softbody.scene import make_scene
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.springs import muscles
+from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 
 EPISODE = 12
 WINDOW = 6
@@ -56,6 +62,26 @@ def compiled(task, policy):
 @pytest.fixture(scope="module")
 def environment(task):
     return CreatureEnvironment(task)
+
+
+@pytest.mark.slow
+def test_a_scene_of_ones_own_is_trained(task):
+    """Another material, a barrier as the ground, and another time step."""
+    creature = task.creature
+    mesh = creature.mesh._replace(vertices=creature.mesh.vertices + np.array([0.0, 0.02]))
+    terms = [
+        elastic(mesh, stable_neo_hookean, youngs_modulus=2e3),
+        gravity(mesh),
+        muscles(creature.muscles, stiffness=90.0),
+    ]
+    ground = obstacle_contact(mesh, half_space([0.0, 1.0]), distance=0.01, stiffness=1e3, friction=0.5)
+    own = {"scene": make_scene(mesh, terms, contacts=[ground]), "dt": 0.02}
+    with one_line("does not suit the task"):
+        make_task(creature, **own, variation=Variation(rough=0.1))
+    other = make_task(creature, **own, episode=EPISODE, clock_period=6.0, variation=Variation(slope=5.0))
+    compiled = compile_learner(other, make_gradient_learner(other, make_policy(other, width=3), QUICK, steps=STEPS))
+    learned = learn(compiled, seed=0, goal=Goal(2 * compiled.learner.steps))
+    assert len(learned.records) == 2 and np.isfinite(learned.distance) and learned.records[-1].skipped == 0
 
 
 def same(one, other):
@@ -94,7 +120,8 @@ def test_observations_do_not_change_if_the_body_is_moved_or_turned(dimension):
     x = vertices + 0.1 * random.normal(size=vertices.shape)
     rotation, _ = np.linalg.qr(random.normal(size=(dimension, dimension)))
     rotation[:, 0] *= np.linalg.det(rotation)
-    for frame in (fitted_frame(vertices), vertex_frame(6, range(dimension))):
+    corners = np.eye(6)[:dimension]
+    for frame in (fitted_frame(vertices), Frame(corners[0], corners[1:] - corners[0])):
         axes = jax.jit(functools.partial(axes_of, frame))
         seen = [(at - frame.origin @ at) @ axes(at).T for at in (x, x @ rotation.T + 3.0)]
         np.testing.assert_allclose(seen[0], seen[1], atol=1e-12)

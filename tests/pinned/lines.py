@@ -200,7 +200,7 @@ def help_texts(capsys):
     found = {}
     for name in COMMANDS:
         try:
-            command(importlib.import_module(f"dln_jax.commands.{name}"), "--help")
+            command(importlib.import_module(f"dln_jax.commands.{name}"), "--help-all")
         except SystemExit:
             found[name] = re.findall(r"--[a-z][\w-]*", capsys.readouterr().out)
     return found

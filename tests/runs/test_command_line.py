@@ -130,7 +130,7 @@ def main(given):
     jax.jit(lambda x: jax.lax.while_loop(lambda x: x[0, 0] > 0, lambda x: x @ x / 100, x))(jax.numpy.ones((100, 100)))
     raise KeyboardInterrupt
 
-running.run(main, Arguments, prog="endless", line=[], from_shell=True)
+running.run(main, Arguments, prog="endless", line=[], began=0.0)
 """
 
 

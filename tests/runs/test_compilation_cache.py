@@ -27,7 +27,7 @@ def main(given):
     jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones(given.size))
     print("found", compilation_cache.compilation().cached - before.cached)
 
-running.run(main, Arguments, prog="tiny", from_shell=True)
+running.run(main, Arguments, prog="tiny", began=0.0)
 '''
 
 

@@ -1,11 +1,14 @@
 """Options are stated without importing JAX: the names and numbers in them are those of the library."""
 
 import dataclasses
+import importlib
 import re
 import subprocess
 import sys
 from types import SimpleNamespace
 from typing import get_args, get_type_hints
+
+import pytest
 
 from dln_jax.commands import COMMANDS, identify, train_delan, train_diffnet, train_hnn, train_hnn_task, train_value
 from dln_jax.control.optimal.plants import PLANTS
@@ -14,7 +17,9 @@ from dln_jax.learning.fits.settings import WAYS
 from dln_jax.mechanics.friction.laws import LAWS, USUAL
 from dln_jax.nn.activations import ALL
 from dln_jax.runs.arguments import arguments_for, resolved
+from dln_jax.runs.help import options_of
 from dln_jax.runs.options import SCENES
+from dln_jax.runs.running import run
 from dln_jax.scenes import registry
 from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -40,6 +45,28 @@ def test_help_and_mistakes_import_no_jax():
     done = subprocess.run([sys.executable, "-c", HELP], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == str(len(COMMANDS))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_is_short_and_every_option_has_a_text(name, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    module = importlib.import_module(f"dln_jax.commands.{name}")
+    texts = []
+    for line in ("--help", "-h", "--help-all"):
+        with pytest.raises(SystemExit) as ended:
+            run(module.main, module.Arguments, prog=name, line=[line])
+        assert ended.value.code == 0
+        texts.append(capsys.readouterr().out)
+    short, same, whole = ([line.rstrip() for line in text.splitlines()] for text in texts)
+    assert short == same and len(short) <= 60 and max(map(len, short + whole)) <= 80
+    assert sum(line.startswith("  --") for line in short) <= 22
+    assert all(option.text.strip() for option in options_of(arguments_for(module.Arguments, {})))
+
+
+def test_a_misspelt_option_is_corrected(capsys):
+    with pytest.raises(SystemExit):
+        run(train_delan.main, train_delan.Arguments, prog="train_delan", line=["--widht", "8"])
+    assert "did you mean --width?" in capsys.readouterr().err
 
 
 def shown(options, name):

@@ -9,9 +9,7 @@ import numpy as np
 from calls import one_line
 
 from dln_jax.commands import __name__, __path__
-from dln_jax.scale.devices import backend_started
-from dln_jax.scale.mesh import batch_mesh, on_devices, replicate, shard, shares, spread, total
-from dln_jax.scale.processes import host_devices
+from dln_jax.scale import backend_started, batch_mesh, host_devices, on_devices, replicate, shard, shares, spread, total
 
 
 def energies(scale, batch):

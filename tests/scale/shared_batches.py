@@ -19,7 +19,7 @@ from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
 from dln_jax.locomotion.learning import Goal, compile_learner, learn, make_policy
 from dln_jax.locomotion.task import make_task
-from dln_jax.scale.mesh import batch_mesh
+from dln_jax.scale import batch_mesh
 from dln_jax.softbody.identification import ObservedMotions, identify
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import Creature

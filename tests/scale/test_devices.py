@@ -7,11 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax import compilation
+from dln_jax import precision, scale
 from dln_jax.export.low_latency import enable_low_latency, low_latency
 from dln_jax.runs.options import Scaled
 from dln_jax.runs.running import run
-from dln_jax.scale import devices
 from dln_jax.types import InputError
 
 
@@ -22,8 +21,8 @@ def on_gpu(monkeypatch):
 
 
 def test_no_options_of_the_cpu_reach_another_compiler(on_gpu, monkeypatch):
-    monkeypatch.setattr(compilation, "_OPTIONS", {"xla_backend_optimization_level": 1})
-    assert compilation.quick_compilation() == {}
+    monkeypatch.setattr(precision, "_OPTIONS", {"xla_backend_optimization_level": 1})
+    assert precision.quick_compilation() == {}
 
 
 def test_low_latency_mode_is_refused_with_the_reason(on_gpu):
@@ -39,16 +38,16 @@ def test_low_latency_mode_is_refused_with_the_reason(on_gpu):
 
 
 def test_advice_where_double_precision_is_slow(on_gpu, monkeypatch):
-    for precision, cost, advice in (("f64", 32.0, ["takes 32 times"]), ("f64", 2.0, []), ("f32", 32.0, [])):
-        monkeypatch.setattr(devices, "double_precision_cost", lambda cost=cost: cost)
-        first, *rest = devices.device_lines(precision)
+    for kind, cost, advice in (("f64", 32.0, ["takes 32 times"]), ("f64", 2.0, []), ("f32", 32.0, [])):
+        monkeypatch.setattr(scale, "double_precision_cost", lambda cost=cost: cost)
+        first, *rest = scale.device_lines(kind)
         assert first == "1 cpu"
         assert all(words in line for words, line in zip(advice, rest, strict=True))
 
 
 def test_nothing_is_printed_on_a_cpu_and_the_cost_is_a_ratio():
-    assert devices.device_lines("f64") == []
-    assert 0 < devices.double_precision_cost(64) < 1000
+    assert scale.device_lines("f64") == []
+    assert 0 < scale.double_precision_cost(64) < 1000
 
 
 @pytest.mark.parametrize("error", [RuntimeError, AssertionError])
@@ -58,7 +57,7 @@ def test_an_unusable_platform_is_one_line(error, monkeypatch, capsys):
     def start(*_):
         raise error("Unable to initialize backend")
 
-    assert devices.unusable_platform() is None
+    assert scale.unusable_platform() is None
     monkeypatch.setattr(jax, "devices", start)
     monkeypatch.setattr(sys, "argv", ["tried"])
     with pytest.raises(SystemExit) as ended:

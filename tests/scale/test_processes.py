@@ -12,7 +12,7 @@ from calls import one_line
 from interpreters import Program, interpreters
 from safetensors.numpy import load_file
 
-from dln_jax.scale.processes import Membership, membership
+from dln_jax.scale import Membership, membership
 
 TINY = '''
 """A command that iterates a map; every step needs all devices, and a process may be lost."""
@@ -26,7 +26,7 @@ from dln_jax.runs.progress import progress
 from dln_jax.runs.running import run
 from dln_jax.runs.stored_arguments import command_folder
 from dln_jax.runs.scaled import mesh_of
-from dln_jax.scale.mesh import of_first_process, shard, spread
+from dln_jax.scale import of_first_process, shard, spread
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import load_tree, save_tree
 

@@ -1,6 +1,9 @@
 """Scenes and time steps of soft bodies: what they keep exactly, what they report, and what they refuse."""
 
 import functools
+import os
+import subprocess
+import sys
 from typing import Any
 
 import jax
@@ -15,6 +18,7 @@ from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
 from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.integrators import BDF2, INTEGRATORS, MIDPOINT
 from dln_jax.softbody.mesh.mesh import make_mesh
+from dln_jax.softbody.mesh.placement import join, translate
 from dln_jax.softbody.mesh.quadratic import quadratic
 from dln_jax.softbody.mesh.shapes import beam, lattice
 from dln_jax.softbody.scene import make_scene, with_parameters
@@ -232,8 +236,25 @@ def test_a_contact_that_would_push_a_body_open_is_refused():
         body_contact(slotted, distance=5e-3, stiffness=1e4)
     body_contact(slotted, distance=2e-3, stiffness=1e4)
     # Two bodies may be as near as that: they rest on each other.
-    above = BAR.vertices + np.array([0.0, 0.103])
-    stacked = make_mesh(np.concatenate([BAR.vertices, above]), np.concatenate([BAR.elements, BAR.elements + N]))
+    stacked = join(BAR, translate(BAR, [0.0, 0.103]))
     body_contact(stacked, distance=5e-3, stiffness=1e4)
     with one_line("capacity"):
         body_contact(stacked, distance=5e-3, stiffness=1e4, capacity=0)
+
+
+THREADS = """
+import ctypes, pathlib, sys
+import scipy.linalg
+import dln_jax.softbody.step
+for path in pathlib.Path(scipy.__file__).parents[1].glob("scipy.libs/*scipy_openblas*"):
+    print(ctypes.CDLL(str(path)).scipy_openblas_get_num_threads())
+"""
+
+
+@pytest.mark.skipif(os.cpu_count() == 1, reason="OpenBLAS has one thread here")
+def test_scipy_factorises_on_one_thread_unless_the_user_asks_for_more():
+    for stated, expected in ({}, "1"), ({"OPENBLAS_NUM_THREADS": "2"}, "2"):
+        environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+        line = [sys.executable, "-c", THREADS]
+        done = subprocess.run(line, env=environment | stated, capture_output=True, text=True, check=True)
+        assert done.stdout.split() in ([expected], []), stated  # not all SciPys bring their own

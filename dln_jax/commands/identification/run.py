@@ -18,7 +18,6 @@ from dln_jax.commands.identification.motions import (
 )
 from dln_jax.commands.identification.verdict import Predict, judge_robot
 from dln_jax.commands.identify import LAWS, NO_FRICTION, TEMPERATURE, Arguments
-from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders.sampling import torque_noise
 from dln_jax.data.log import SPLIT, read_log
 from dln_jax.data.parts import Parts, split_log
@@ -41,6 +40,7 @@ from dln_jax.mechanics.trees.motors import Pair, armature_matrix, require_motors
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.trees import RigidTreeParameters, Rows, pairs_of
+from dln_jax.precision import quick_compilation
 from dln_jax.runs.arguments import (
     names_in,
     names_listed,

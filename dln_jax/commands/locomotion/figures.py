@@ -11,7 +11,7 @@ from dln_jax.figures import style
 from dln_jax.figures.soft_bodies import write_soft_body_gif
 from dln_jax.locomotion.learning import GOAL, Record
 from dln_jax.locomotion.task import LocomotionTask, Walk, beginning
-from dln_jax.softbody.terms.creature import TIME_STEP, ground_height
+from dln_jax.softbody.terms.creature import ground_height
 
 FILMED = 160
 """Steps of the film."""
@@ -43,11 +43,11 @@ def write_gait(path: Path, task: LocomotionTask, seen: Walk, title: str) -> None
         path,
         task.creature.mesh,
         x,
-        TIME_STEP * np.arange(len(x)),
+        task.dt * np.arange(len(x)),
         muscles=task.creature.muscles,
         ground=ground,
         actuation=np.concatenate([seen.actuation[:1], seen.actuation])[: FILMED + 1],
         title=title,
         stride=2,
-        frames_per_second=0.5 / TIME_STEP,
+        frames_per_second=0.5 / task.dt,
     )

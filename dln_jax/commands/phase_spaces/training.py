@@ -28,7 +28,7 @@ from dln_jax.learning.shooting import (
     phase_problem,
 )
 from dln_jax.models.model import Model, Parameters
-from dln_jax.scale.mesh import of_first_process
+from dln_jax.scale import of_first_process
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import Description, build
 from dln_jax.zoo.run import save

@@ -3,8 +3,8 @@
     g*(w) = max_u wᵀu - g(u),   attained at u = grad g*(w)
 
 With the cost to go V, dynamics a + B u and cost q + g, the optimal control is u = grad g*(-Bᵀ dV/dx). A cost that is
-infinite beyond limits keeps the control within them. The basic costs are those of the paper's table 1; rules derive
-others from them.
+infinite beyond limits keeps the control within them. An `ActionCost` of your own is three functions; the documentation
+lists those of the paper's table 1.
 """
 
 from collections.abc import Callable
@@ -14,9 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.scipy.special import xlogy
 
-from dln_jax.nn.activations import softplus
 from dln_jax.types import InputError, Scalar, require_positive
 
 
@@ -57,67 +55,11 @@ def quadratic(R: Any) -> ActionCost:
     )
 
 
-def _within(lower: float, upper: float, cost: Callable[[Array], Array]) -> Callable[[Array], Scalar]:
-    """Returns the sum over controls, infinite if one is out of range; NaN stays NaN."""
-    return lambda u: jnp.sum(jnp.where((u < lower) | (u > upper), jnp.inf, cost(jnp.clip(u, lower, upper))))
-
-
-def _entropy(u: Array) -> Array:
-    return xlogy(u, u) + xlogy(1 - u, 1 - u)
-
-
-logistic = ActionCost(_within(0.0, 1.0, _entropy), softplus.first, lambda w: jnp.sum(softplus.value(w)))
-"""u log u + (1 - u) log(1 - u) on (0, 1)."""
-atan = ActionCost(
-    _within(-np.pi / 2, np.pi / 2, lambda u: -jnp.log(jnp.cos(u))),
-    jnp.arctan,
-    lambda w: jnp.sum(w * jnp.arctan(w) - 0.5 * jnp.log1p(w**2)),
-)
-"""-log cos u on (-π/2, π/2)."""
-tanh = ActionCost(
-    _within(-1.0, 1.0, lambda u: _entropy((u + 1) / 2) + np.log(2)),
-    jnp.tanh,
-    # log cosh w without its overflow.
-    lambda w: jnp.sum(softplus.value(2 * w) - w - np.log(2)),
-)
-"""The entropy of (u + 1)/2, zero at 0, on (-1, 1)."""
-bang_bang = ActionCost(_within(-1.0, 1.0, lambda u: 0 * u), jnp.sign, lambda w: jnp.sum(jnp.abs(w)))
-"""Zero within [-1, 1]: the control is at a limit."""
-bang_lin = ActionCost(
-    _within(-1.0, 1.0, lambda u: 0.5 * u**2),
-    lambda w: jnp.clip(w, -1, 1),
-    lambda w: jnp.sum(jnp.where(jnp.abs(w) <= 1, 0.5 * w**2, jnp.abs(w) - 0.5)),
-)
-"""½ u² within [-1, 1]: linear up to the limits."""
-
-
-def scaled(cost: ActionCost, a: Any) -> ActionCost:
-    """Returns a g(u/a): the range is a times as wide, for all controls."""
-    _require_scale(a=a)
-    return ActionCost(lambda u: a * cost.cost(u / a), lambda w: a * cost.policy(w), lambda w: a * cost.conjugate(w))
-
-
-def weighted(cost: ActionCost, b: Any) -> ActionCost:
-    """Returns b g(u): controls cost b times as much."""
-    _require_scale(b=b)
-    return ActionCost(lambda u: b * cost.cost(u), lambda w: cost.policy(w / b), lambda w: b * cost.conjugate(w / b))
-
-
 def stretched(cost: ActionCost, a: Any) -> ActionCost:
     """Returns g(u / a), with a separate range for every control: a [m], or one for all."""
     a = np.asarray(a, float)
     _require_scale(a=a.min())
     return ActionCost(lambda u: cost.cost(u / a), lambda w: a * cost.policy(a * w), lambda w: cost.conjugate(a * w))
-
-
-def shifted(cost: ActionCost, c: Any) -> ActionCost:
-    """Returns g(u + c) - g(c): the range is shifted by -c."""
-    c = jnp.asarray(c, float)
-    return ActionCost(
-        lambda u: cost.cost(u + c) - cost.cost(c),
-        lambda w: cost.policy(w) - c,
-        lambda w: cost.conjugate(w) - jnp.sum(c * w) + cost.cost(c),
-    )
 
 
 def centred(cost: ActionCost, u: Any) -> ActionCost:
@@ -159,7 +101,18 @@ def limited_atan(limit: float, weight: float) -> ActionCost:
         InputError: a number is not positive.
     """
     _require_scale(limit=limit, weight=weight)
-    return weighted(scaled(atan, 2 * limit / np.pi), weight)
+    a = 2 * limit / np.pi
+
+    def cost(u: Array) -> Scalar:
+        angle = u / a
+        inside = jnp.clip(angle, -np.pi / 2, np.pi / 2)
+        return weight * (a * jnp.sum(jnp.where(jnp.abs(angle) > np.pi / 2, jnp.inf, -jnp.log(jnp.cos(inside)))))
+
+    def conjugate(w: Array) -> Scalar:
+        w = w / weight
+        return weight * (a * jnp.sum(w * jnp.arctan(w) - 0.5 * jnp.log1p(w**2)))
+
+    return ActionCost(cost, lambda w: a * jnp.arctan(w / weight), conjugate)
 
 
 def _require_scale(**numbers: Any) -> None:

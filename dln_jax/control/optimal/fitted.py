@@ -30,8 +30,8 @@ from dln_jax.control.optimal.flow import Targets, drawn, greedy, targets, widene
 from dln_jax.control.optimal.problem import ControlProblem
 from dln_jax.control.optimal.value_networks import ValueNetwork
 from dln_jax.control.optimal.worst_case import Disturbance
-from dln_jax.interrupts import held_back
-from dln_jax.scale.mesh import local, program, spread
+from dln_jax.process import held_back
+from dln_jax.scale import local, program, spread
 from dln_jax.types import InputError, require_positive
 
 VALIDATED = 256

@@ -19,12 +19,12 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.control.optimal.flow import uniform
 from dln_jax.control.optimal.problem import ControlProblem, checked, hjb_residual, optimal_control
 from dln_jax.control.optimal.worst_case import Disturbance
-from dln_jax.interrupts import held_back
-from dln_jax.scale.mesh import local, of_first_process, program
+from dln_jax.precision import quick_compilation
+from dln_jax.process import held_back
+from dln_jax.scale import local, of_first_process, program
 from dln_jax.solvers import levenberg_marquardt
 from dln_jax.types import InputError, require_positive
 

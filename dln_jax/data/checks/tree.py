@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.data.checks.channels import Finding, away_from_ends, on_joints
 from dln_jax.data.checks.priors import Build, Inertias, Log, Prior, friction, gyroscopic, sizes_of
 from dln_jax.data.checks.torques import Torques, check_torques, examine_torques
@@ -15,6 +14,7 @@ from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.recursions import regressor
+from dln_jax.precision import quick_compilation
 from dln_jax.solvers import least_squares
 from dln_jax.types import JointKind
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from dln_jax.export.c.interface import KINDS, Leaf, Signature
 from dln_jax.export.c.text import NUMPY_TYPES, PRECISIONS
-from dln_jax.export.low_latency import as_shaped
+from dln_jax.mechanics.arguments import require_shape
 from dln_jax.types import InputError
 
 _GIVES = {"real": "PyFloat_FromDouble((double){})", "unsigned_long": "PyLong_FromUnsignedLongLong({})"}
@@ -187,10 +187,15 @@ def _converting(
 
 
 def _array(leaf: Leaf, argument: Any, precision: str) -> np.ndarray:
-    if leaf.kind == "bool":
-        argument = np.asarray(argument)
-        argument = argument.astype(np.int32) if argument.dtype == bool else argument
-    return np.array(as_shaped(leaf.name, argument, leaf.shape), _type(leaf.kind, precision), order="C")
+    """Returns the argument as a contiguous array of the leaf's shape and type; `InputError` if it has another shape."""
+    try:
+        array = np.asarray(argument)
+    except (ValueError, TypeError):
+        raise InputError(f"{leaf.name} is not an array; expected real numbers of shape {leaf.shape}") from None
+    if array.dtype.kind not in ("fiub" if leaf.kind == "bool" else "fiu"):
+        raise InputError(f"{leaf.name} has type {array.dtype}; expected real numbers of shape {leaf.shape}")
+    require_shape(leaf.name, array.shape, leaf.shape)
+    return np.array(array, _type(leaf.kind, precision), order="C")
 
 
 def _type(kind: str, precision: str) -> Any:

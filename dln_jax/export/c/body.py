@@ -60,7 +60,7 @@ class Source:
     orders: set[tuple[str, ...]] = field(default_factory=set)
     """Kinds of the keys of every sort."""
     parts: dict[bytes, "Called"] = field(default_factory=dict)
-    """Functions that others call, by the digest of their program."""
+    """Functions that others call, by the key of their program."""
     names: dict[str, str] = field(default_factory=dict)
     """Names of these functions, by their text."""
 

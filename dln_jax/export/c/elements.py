@@ -8,7 +8,7 @@ import numpy as np
 
 from dln_jax.export.c.body import Body
 from dln_jax.export.c.nodes import Node, is_constant, owners, read_source, strides, values
-from dln_jax.export.c.operations import OPERATIONS, VECTORISED, expression
+from dln_jax.export.c.operations import BY_BITS, OPERATIONS, VECTORISED, expression
 from dln_jax.export.c.simplify import UNROLL_LIMIT
 from dln_jax.export.c.text import C_TYPES, NUMPY_TYPES
 
@@ -65,8 +65,8 @@ def _expression(body: Body, node: Node, args: list[str], *, looped: bool = False
     if looped and node.dtype == "real" and node.op in _CHOICES:
         body.source.functions.add("choice")
         return _CHOICES[node.op].format(*args)
-    if node.op in ("rounded", "lt_to", "le_to"):
-        body.source.functions.add("rounded" if node.op == "rounded" else "ordered")
+    if (function := BY_BITS.get(node.op)) is not None:
+        body.source.functions.add(function)
     if name := _guarded(node):
         body.source.integers.add(name)
         return f"elementary_{name}({', '.join(args)})"

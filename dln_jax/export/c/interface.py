@@ -1,6 +1,8 @@
 """Interface of an exported source: signatures of its functions, their C declarations and the JSON description."""
 
+import hashlib
 import inspect
+import json
 from collections.abc import Callable, Mapping, Sequence
 from math import prod
 from pathlib import Path
@@ -10,11 +12,12 @@ import jax
 import numpy as np
 
 from dln_jax.export.c.text import C_TYPES, LARGEST, PRECISIONS, check_name, kind_of
-from dln_jax.export.exports import AGAIN, read_export
+from dln_jax.files import read_json
 from dln_jax.types import InputError
 
 FORMAT = 5
 """Version of the names and signatures in exported sources and of the JSON description."""
+AGAIN = "export it again"
 KINDS = {kind: c for kind, c in C_TYPES.items() if kind != "index"}
 
 
@@ -77,7 +80,9 @@ def result_leaves(shapes: Any, taken: Sequence[Leaf]) -> list[Leaf]:
 
 
 def array_of(leaf: Any) -> Any:
-    """Returns an array, or a number as an array."""
+    """Returns an array, a number as an array, or zeros for a shape."""
+    if isinstance(leaf, jax.ShapeDtypeStruct):
+        return np.zeros(leaf.shape, leaf.dtype)
     return leaf if hasattr(leaf, "dtype") else np.asarray(leaf)
 
 
@@ -116,14 +121,18 @@ def declaration(name: str, function: str, signature: Signature, real: str) -> st
     return f"{returned} {name}_{function}({', '.join(parameters) or 'void'})"
 
 
-def description(name: str, precision: str, version: str, functions: Mapping[str, Signature]) -> dict[str, Any]:
-    """Returns the JSON description of an export, without digests."""
+def description(
+    name: str, precision: str, version: str, functions: Mapping[str, Signature], files: Mapping[str, bytes]
+) -> bytes:
+    """Returns the JSON description of an export: its functions, and the digests of its files."""
     # JSON turns leaves and shapes, which are tuples, into lists.
     stated = {
         key: {"arguments": function.arguments, "results": function.results, **function.cost._asdict()}
         for key, function in functions.items()
     }
-    return {"format": FORMAT, "version": version, "name": name, "precision": precision, "functions": stated}
+    facts = {"format": FORMAT, "version": version, "name": name, "precision": precision, "functions": stated}
+    digests = {file: hashlib.sha256(content).hexdigest() for file, content in files.items()}
+    return json.dumps({**facts, "files": digests}, indent=2).encode() + b"\n"
 
 
 def stated_costs(directory: str | Path, *, name: str = "model") -> dict[str, Cost]:
@@ -141,20 +150,26 @@ def read_interface(directory: Path, name: str) -> tuple[str, dict[str, Signature
     Raises:
         InputError: a file is missing or altered, the format differs, or the description contradicts the header.
     """
-    path = directory / f"{name}.json"
-    stated, files = read_export(path, (f"{name}.h", f"{name}.c"))
+    path, files = directory / f"{name}.json", {}
+    stated = read_json(path, remedy=f"{AGAIN}, and keep its files together")
     if stated.get("format") != FORMAT:
         raise InputError(f"{path}: C format {stated.get('format')!r}; this release reads format {FORMAT}, so {AGAIN}")
-    precision, header = stated.get("precision"), files[f"{name}.h"].decode(errors="replace")
     try:
-        if stated.get("name") != name or precision not in PRECISIONS:
-            raise InputError(f"name is {stated.get('name')!r:.60} and precision {precision!r:.60}")
+        for file in (path.with_suffix(".h"), path.with_suffix(".c")):
+            files[file.name] = file.read_bytes()
+            if hashlib.sha256(files[file.name]).hexdigest() != stated["files"][file.name]:
+                raise InputError(f"{file.name} is truncated or altered, by its SHA-256")
+        precision, header = stated["precision"], files[f"{name}.h"].decode(errors="replace")
+        if stated["name"] != name or precision not in PRECISIONS:
+            raise InputError(f"name is {stated['name']!r:.60} and precision {precision!r:.60}")
         functions = {str(key): _signature(value) for key, value in dict(stated["functions"]).items()}
         for key, function in functions.items():
             if f"{declaration(name, check_name(key), function, PRECISIONS[precision][1])};" not in header:
                 raise InputError(f"{key} is not declared so in {name}.h")
+    except OSError as error:
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror}); {AGAIN}") from error
     except (InputError, TypeError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: contradicts itself ({error!s:.200}); {AGAIN}") from error
+        raise InputError(f"{path}: does not describe the files beside it ({error!s:.200}); {AGAIN}") from error
     return precision, functions, files
 
 

@@ -1,12 +1,10 @@
 """Jaxprs: how to make them, which calls they repeat, and which line of Python made an equation."""
 
-import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-import numpy as np
 from jax.extend import core
 
 from dln_jax.types import InputError
@@ -19,10 +17,14 @@ def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, 
     """Returns the closed jaxpr of a function, and the tree of its results.
 
     Raises:
-        InputError: the function has side effects, or integers beyond 64 bits.
+        InputError: the function has side effects, integers beyond 64 bits, or branches of Python on an argument.
     """
     try:
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
+    except jax.errors.ConcretizationTypeError as error:
+        raise InputError(
+            "the function needs the value of an argument in Python, such as for `if x > 0`; write jnp.where or lax.cond"
+        ) from error
     except OverflowError as error:
         raise InputError(f"a whole number is out of range ({error}); C has integers of up to 64 bits") from error
     if closed.effects:
@@ -31,36 +33,28 @@ def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, 
 
 
 def repeated_calls(every: Sequence[Any]) -> set[int]:
-    """Returns the `id` values of large jaxprs that these closed jaxprs seem to call several times.
+    """Returns the `id` values of large jaxprs that these closed jaxprs call several times.
 
-    Such calls become one function only if their programs are identical (`Program.identity`).
+    Calls of one jitted function with arguments of equal types share a jaxpr, which JAX keeps.
     """
-    known: dict[int, tuple[int, bytes]] = {}
-    counts: Counter[bytes] = Counter()
+    sizes: dict[int, int] = {}
+    counts: Counter[int] = Counter()
 
-    def visit(jaxpr: Any) -> tuple[int, bytes]:
-        """Returns the number of equations, including calls, and a digest of primitives, types and constants."""
-        if id(jaxpr) in known:
-            return known[id(jaxpr)]
-        closed, size, digest = closed_jaxpr(jaxpr), 0, hashlib.sha256()
-        for const in closed.consts:
-            digest.update(np.asarray(const).tobytes())
-        for equation in closed.jaxpr.eqns:
-            avals = [variable.aval for variable in equation.outvars if hasattr(variable.aval, "dtype")]
-            digest.update(repr((equation.primitive.name, [(aval.shape, str(aval.dtype)) for aval in avals])).encode())
-            for literal in (variable.val for variable in equation.invars if hasattr(variable, "val")):
-                digest.update(np.asarray(literal).tobytes())
-            values = equation.params.values() if _of_jax(equation.primitive) else ()
-            calls = [visit(inner) for value in values for inner in _jaxprs(value)]
-            counts.update(likeness for count, likeness in calls if count >= _LARGE_CALL)
-            digest.update(b"".join(likeness for _, likeness in calls))
-            size += max(1, sum(count for count, _ in calls))
-        known[id(jaxpr)] = size, digest.digest()
-        return known[id(jaxpr)]
+    def size(jaxpr: Any) -> int:
+        """Returns the number of equations, including those of calls."""
+        if id(jaxpr) not in sizes:
+            total = 0
+            for equation in closed_jaxpr(jaxpr).jaxpr.eqns:
+                values = equation.params.values() if _of_jax(equation.primitive) else ()
+                inside = [inner for value in values for inner in _jaxprs(value)]
+                counts.update(map(id, inside))
+                total += max(1, sum(map(size, inside)))
+            sizes[id(jaxpr)] = total
+        return sizes[id(jaxpr)]
 
     for closed in every:
-        visit(closed)
-    return {identity for identity, (size, likeness) in known.items() if size >= _LARGE_CALL and counts[likeness] > 1}
+        size(closed)
+    return {identity for identity, count in counts.items() if count > 1 and sizes[identity] >= _LARGE_CALL}
 
 
 def _jaxprs(value: Any) -> list[Any]:

@@ -62,6 +62,17 @@ def _householder_product(program: Program, a: Node, tau: Node) -> list[Node]:
     return _applied(program, "householder_product", a, tau, shapes=[a.shape[-2:]], ranks=(2, 1))
 
 
+def _ormqr(program: Program, a: Node, tau: Node, c: Node, *, left: bool, transpose: bool) -> Node:
+    """Multiplies by the whole orthogonal matrix of reflectors."""
+    *batch, m, n = a.shape
+    index = np.arange(a.size).reshape(a.shape)
+    square = np.pad(index, [(0, 0)] * (len(batch) + 1) + [(0, m - n)], constant_values=a.size)
+    (q,) = _householder_product(program, program.gather([a, program.constant(0.0, "real")], square), tau)
+    q, c = (program.reshape(node, (prod(batch), *node.shape[-2:])) for node in (q, c))
+    q = program.transpose(q) if transpose else q
+    return program.reshape(program.dot_general(*((q, c) if left else (c, q))), (*batch, *c.shape[-2:]))
+
+
 def _qr(program: Program, a: Node, *, full_matrices: bool) -> list[Node]:
     """Applies `qr` by the two rules above, as JAX does."""
     (*batch, m, n), full = a.shape, full_matrices
@@ -87,6 +98,7 @@ def _eigh(program: Program, a: Node, *, lower: bool, subset_by_index) -> list[No
 RULES = {
     "geqrf": _geqrf,
     "householder_product": _householder_product,
+    "ormqr": _ormqr,
     "qr": _qr,
     "eigh": _eigh,
     "cholesky": lambda program, a: _applied(program, "cholesky", a, shapes=[a.shape[-2:]]),

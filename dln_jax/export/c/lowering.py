@@ -25,7 +25,7 @@ _WITHOUT_EFFECT = frozenset((
     "accuracy", "algorithm", "use_magma", "sharding", "out_sharding", "unroll", "linear",
     "_split_transpose", "weak_type", "new_dtype", "dtype", "index_dtype", "preferred_element_type",
     "indices_are_sorted", "unique_indices", "is_stable", "sort_eigenvalues", "conjugate_a", "branches_platforms",
-    "ft_in", "ft_out", "num_consts", "num_carry",
+    "ft_in", "ft_out", "memory_space", "devices", "srcs", "copy_semantics", "num_consts", "num_carry",
 ))  # fmt: skip
 """Parameters that no value depends on: hints, promises, and types that the results have anyway."""
 _REFUSED = {
@@ -137,7 +137,7 @@ def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
     """Returns the results of a call; constant arguments become part of the called function."""
     fixed = {k: arg for k, arg in enumerate(args) if is_constant(arg)}
     call = id(closed), tuple((k, values(arg).tobytes()) for k, arg in fixed.items())
-    if call not in program.lowered:
+    if call not in program.parts:
         part = replace(program, nodes=[], loops={}, floor=(), _interned={}, _scalars={})
         inside = [
             part.constant(values(arg), arg.dtype)
@@ -145,13 +145,10 @@ def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
             else part.make("input", arg.shape, arg.dtype, attribute=k - sum(place < k for place in fixed))
             for k, arg in enumerate(args)
         ]
-        results = _inline(part, closed, inside)
-        program.lowered[call] = part.identity(results)
-        program.parts.setdefault(program.lowered[call], Part(part, results))
-    key = program.lowered[call]
-    shapes = [(result.shape, result.dtype) for result in program.parts[key].results]
+        program.parts[call] = Part(part, _inline(part, closed, inside))
+    shapes = [(result.shape, result.dtype) for result in program.parts[call].results]
     passed = [arg for k, arg in enumerate(args) if k not in fixed]
-    return control_flow.projections(program, program.make("call", (), "int", passed, attribute=key), shapes)
+    return control_flow.projections(program, program.make("call", (), "int", passed, attribute=call), shapes)
 
 
 def _custom_linear_solve(program: Program, *args: Node, const_lengths: Any, jaxprs: Any) -> list[Node]:

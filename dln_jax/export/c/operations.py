@@ -53,6 +53,10 @@ def _shifted_right(a, b, *, kind: str):
     return np.right_shift(a.view(typed), b.view(typed)).view(a.dtype)
 
 
+def _bits(kind: str) -> Callable[..., Any]:
+    return lambda x: x.view(NUMPY_TYPES[kind])
+
+
 class Operation(NamedTuple):
     """An elementwise operation."""
 
@@ -136,6 +140,12 @@ OPERATIONS = {
         f"to_{kind}": Operation(f"(({C_TYPES[kind]}){{0}})", functools.partial(_converted, kind=kind), 0, kind)
         for kind in NUMPY_TYPES
     },
+    # Bits of a number as a word of its size, and back.
+    **{
+        f"{kind}_word_of": Operation(f"(({C_TYPES[kind]})elementary_word_of({{0}}))", _bits(kind), 0, kind)
+        for kind in UNSIGNED
+    },
+    "number_of": Operation("elementary_number_of({0})", lambda x: x.view(f"f{x.itemsize}"), 0, "real"),
     "to_real": Operation("((real){0})", lambda x: x, 0, "real"),
     "to_bool": Operation("({0} != 0)", lambda x: x != 0, 0, "bool"),
 }
@@ -153,6 +163,11 @@ TRANSCENDENTAL = frozenset(name for name, operation in OPERATIONS.items() if ope
 """Operations that call a function of <math.h>, except sqrt."""
 VECTORISED = frozenset(_VECTORISED)
 """Operations whose C vectorises in loops."""
+BY_BITS = {
+    "rounded": "rounded", "lt_to": "ordered", "le_to": "ordered", "number_of": "choice",
+    **{f"{kind}_word_of": "choice" for kind in UNSIGNED},
+}  # fmt: skip
+"""The part of the elementary functions that an operation on the bits of numbers needs."""
 _ON_BOOL = {"add": "or", "mul": "and", "max": "or", "min": "and", "ne": "xor"}
 
 

@@ -16,7 +16,7 @@ from dln_jax.export.c.nodes import Node, zeros
 from dln_jax.export.c.operations import on_kind
 from dln_jax.export.c.program import Program
 from dln_jax.export.c.simplify import UNROLL_LIMIT, neutral
-from dln_jax.export.c.text import UNSIGNED
+from dln_jax.export.c.text import NUMPY_TYPES, UNSIGNED
 from dln_jax.types import InputError
 
 Rule = Callable[..., Any]
@@ -161,6 +161,20 @@ def _select_n(program: Program, which: Node, *cases: Node) -> Node:
     return result
 
 
+def _bits(program: Program, x: Node, *, results: Any, kind: str) -> Node:
+    """Applies `bitcast_convert_type` between types of one size."""
+    word = "unsigned_long" if np.dtype(program.real).itemsize == 8 else "unsigned"
+    if results[0].shape != x.shape or (x.dtype == "real" and NUMPY_TYPES[word]().itemsize != results[0].dtype.itemsize):
+        raise InputError("the primitive 'bitcast_convert_type' has C for types of one size")
+    if x.dtype == "real" != kind:
+        return convert(program, program.elementwise(f"{word}_word_of", x), kind)
+    return program.elementwise("number_of", convert(program, x, word)) if kind == "real" else convert(program, x, kind)
+
+
+def _empty(program: Program, *, kind: str, shape: tuple[int, ...] = ()) -> Node:
+    return program.constant(np.zeros(shape), kind)
+
+
 def _iota(program: Program, *, shape, dimension: int, kind: str) -> Node:
     return program.constant(np.indices(shape)[dimension], kind)
 
@@ -237,7 +251,7 @@ _OF_REDUCTIONS = {"sum": "add", "prod": "mul", "max": "max", "min": "min", "and"
 RULES: dict[str, Rule] = {
     **{name: _elementwise(name) for name in _AS_NAMED},
     "add_any": _elementwise("add"),
-    **dict.fromkeys(("stop_gradient", "copy", "copy_p", "optimization_barrier"), lambda _, *nodes: nodes),
+    **dict.fromkeys(("stop_gradient", "copy", "copy_p", "device_put", "optimization_barrier"), lambda _, *nodes: nodes),
     "square": lambda program, x: program.elementwise("mul", x, x),
     **{name: _comparison(name) for name in ("eq", "ne", "lt", "le", "gt", "ge")},
     **{f"{name}_to": _total_order(name) for name in ("lt", "le")},
@@ -253,6 +267,9 @@ RULES: dict[str, Rule] = {
     "select_n": _select_n,
     "convert_element_type": lambda program, x, *, kind: convert(program, x, kind),
     "iota": _iota,
+    "empty": _empty,
+    "empty2": _empty,
+    "bitcast_convert_type": _bits,
     "broadcast_in_dim": _moved(_broadcast_in_dim),
     "reshape": _moved(lambda index, *, new_sizes: index.reshape(new_sizes)),
     "squeeze": _moved(lambda index, *, dimensions: np.squeeze(index, tuple(dimensions))),

@@ -23,7 +23,6 @@ gathers and selections at constant indices) is a `gather`: it names the source o
 `simplify` decides which operations are replaced by simpler ones and which are written as scalars.
 """
 
-import hashlib
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from math import prod
@@ -57,10 +56,8 @@ class Program:
     """NumPy type of real numbers; constants are folded in it."""
     repeated: Collection[int] = ()
     """`id` values of jaxprs whose calls stay calls."""
-    parts: dict[bytes, Part] = field(default_factory=dict)
-    """Called programs by their `identity`, which is the attribute of a `call`."""
-    lowered: dict[Any, bytes] = field(default_factory=dict)
-    """Identities of called programs, by the `id` of the jaxpr and the constant arguments."""
+    parts: dict[Any, Part] = field(default_factory=dict)
+    """Called programs by the `id` of the jaxpr and the constant arguments, which are the attribute of a `call`."""
     inline: Any = None
     """(program, closed jaxpr, arguments) -> results."""
     finite: bool = False
@@ -95,22 +92,6 @@ class Program:
         self.nodes.append(node)
         self._interned[key].append(node)
         return node
-
-    def identity(self, results: Sequence[Node]) -> bytes:
-        """Returns a digest of everything that the results depend on, with constants bit for bit."""
-        digest = hashlib.sha256()
-        for node in self.nodes:
-            value_type = None if node.value is None else node.value.dtype.str
-            args = [arg.number for arg in node.args]
-            digest.update(
-                repr((node.op, node.shape, node.dtype, args, node.attribute, value_type, node.region)).encode()
-            )
-            digest.update(b"" if node.value is None else node.value.tobytes())
-        for number, loop in self.loops.items():
-            inside = [[node.number for node in nodes] for nodes in (loop.carries, loop.conditions, loop.results)]
-            digest.update(repr((number, inside, loop.length, loop.reverse)).encode())
-        digest.update(repr([result.number for result in results]).encode())
-        return digest.digest()
 
     def constant(self, value: Any, dtype: str) -> Node:
         """Returns a constant of a kind."""

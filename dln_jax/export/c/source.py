@@ -4,8 +4,10 @@ The source holds constant tables and functions of one state, with no allocation,
 no library but <math.h>. The same functions, name and precision give the same files, byte for byte.
 """
 
+import functools
 import importlib.metadata
 import re
+from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,7 +31,7 @@ from dln_jax.export.c.jaxprs import repeated_calls, traced
 from dln_jax.export.c.lowering import program_of
 from dln_jax.export.c.templates import CASADI_ABOUT, CASADI_BUILD, NEEDED, about, cmake, demo, header, preamble
 from dln_jax.export.c.text import PRECISIONS, check_name, comment, kind_of
-from dln_jax.export.exports import described, write_exports
+from dln_jax.export.exports import write_exports
 from dln_jax.precision import computing_in
 from dln_jax.types import InputError, require_positive
 
@@ -108,6 +110,12 @@ def source_files(
     require_positive(stack=stack, loop_bound=1 if loop_bound is None else loop_bound)
     if not functions:
         raise InputError("there is no function to export; give at least one, as {'name': (function, examples)}")
+    for key, pair in functions.items():
+        if not (isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[1], tuple | list)):
+            raise InputError(
+                f"{key} is {pair!r:.60}; expected (function, examples), one example for each argument: (f, (x,))"
+            )
+    functions = {key: (_in_written_order(function), examples) for key, (function, examples) in functions.items()}
     precision = precision or _precision(functions)
     if precision not in PRECISIONS:
         raise InputError(f"precision is {precision!r}; expected f32 or f64")
@@ -137,7 +145,20 @@ def source_files(
     if (longest := max(map(len, files.values()))) > LENGTH:
         raise InputError(f"the source would take {longest / 1e6:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")
     encoded = {file_name: text.encode() for file_name, text in files.items()}
-    return {**encoded, f"{name}.json": described(description(name, precision, version, signatures), encoded)}
+    return {**encoded, f"{name}.json": description(name, precision, version, signatures, encoded)}
+
+
+def _in_written_order(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns the function with its results in the order in which a dictionary was written; JAX would sort the keys."""
+
+    def ordered(tree: Any) -> Any:
+        return OrderedDict((key, ordered(value)) for key, value in tree.items()) if type(tree) is dict else tree
+
+    @functools.wraps(function)
+    def call(*arguments: Any) -> Any:
+        return ordered(function(*arguments))
+
+    return call
 
 
 def _precision(functions: Functions) -> str:

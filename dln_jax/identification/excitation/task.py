@@ -15,13 +15,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.identification.base import unit_columns
 from dln_jax.identification.excitation.fourier import rest_basis
 from dln_jax.identification.excitation.limits import Clearance, Excess, MotionLimits, excess, require_limits
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters, linearised
-from dln_jax.precision import require_double_precision
+from dln_jax.precision import quick_compilation, require_double_precision
 from dln_jax.types import InputError, require_positive, require_seed
 
 SAMPLES = 20

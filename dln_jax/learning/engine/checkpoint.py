@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 from dln_jax.files import finite, is_file
 from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Progress, plain
-from dln_jax.time_limit import seconds_left
+from dln_jax.process import seconds_left
 from dln_jax.types import InputError
 from dln_jax.zoo import parameter_files as checkpoints
 

@@ -9,7 +9,6 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
-from dln_jax.interrupts import held_back
 from dln_jax.learning.engine import newton, optimisers
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.optimisers import Adam, Optimiser
@@ -24,7 +23,8 @@ from dln_jax.learning.engine.problem import (
     sharing,
     silent,
 )
-from dln_jax.scale.mesh import local, of_first_process, replicate
+from dln_jax.process import held_back
+from dln_jax.scale import local, of_first_process, replicate
 from dln_jax.types import InputError, require_positive
 
 

@@ -27,7 +27,7 @@ from dln_jax.learning.engine.problem import (
     no_best,
 )
 from dln_jax.precision import require_float64
-from dln_jax.scale.mesh import first, mean, share, shares
+from dln_jax.scale import first, mean, share, shares
 from dln_jax.solvers.levenberg_marquardt import CHUNK
 from dln_jax.solvers.normal_equations import count, jacobian_bytes
 from dln_jax.types import InputError, require_positive

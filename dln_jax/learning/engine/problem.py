@@ -11,7 +11,7 @@ from jax import Array
 from jax.sharding import Mesh
 
 from dln_jax.data.arrays import on_device
-from dln_jax.scale.mesh import on_devices, spread
+from dln_jax.scale import on_devices, spread
 from dln_jax.types import InputError, Scalar
 
 NO_START = "the loss is not finite before training; look for very large numbers in the data"

@@ -37,7 +37,7 @@ from dln_jax.learning.objectives import (
 )
 from dln_jax.learning.select import mean_of_segments, select
 from dln_jax.mechanics.friction.laws import USUAL
-from dln_jax.scale.devices import device_lines
+from dln_jax.scale import device_lines
 from dln_jax.types import InputError, Needs, require_positive
 from dln_jax.zoo.descriptions import Description, build, describe_for
 

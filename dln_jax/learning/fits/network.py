@@ -22,10 +22,9 @@ from dln_jax.learning.fits.settings import OF_ADAM, Network
 from dln_jax.learning.latency import latency_of
 from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, objective_of
 from dln_jax.learning.select import say_selection
-from dln_jax.scale.devices import device_lines
-from dln_jax.scale.mesh import of_first_process
+from dln_jax.process import SOON
+from dln_jax.scale import device_lines, of_first_process
 from dln_jax.sizes import require_network
-from dln_jax.time_limit import SOON
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build, describe_for

@@ -49,7 +49,7 @@ class Goal(Way):
     precision: Unstated[Precision] = None
     """Floating-point type (default: f64; f32 for adam)."""
     objective: Unstated[Literal["inverse", "forward", "both"]] = None
-    """Errors to minimise: torques, accelerations or both (default: inverse; feed-forward: both)."""
+    """Errors of torques, accelerations or both (default: inverse; feed-forward: both)."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Network(Goal):
 
     model: str = "structured-delan"
     optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
-    """gauss-newton is far more accurate for small networks."""
+    """gauss-newton is more accurate for small networks."""
     width: Unstated[int] = None
     """Hidden units per layer (default: structured 8, others 16, adam 64; chosen from the data for 4 joints or more)."""
     depth: Unstated[int] = None
@@ -68,7 +68,7 @@ class Network(Goal):
     steps: Unstated[int] = None
     """Iterations (default: structured 150, others 400, adam 20000; for 4 joints or more 40 and 6000)."""
     seeds: int = 1
-    """Number of seeds in one program; the best in cross-validation is kept."""
+    """Seeds in one program; cross-validation keeps the best."""
     batch: Unstated[int] = None
     """adam: samples per step (default: 512)."""
     learning_rate: Unstated[float] = None

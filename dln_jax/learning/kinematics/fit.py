@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import drawn
 from dln_jax.learning.kinematics.agreement import Twin, difference
@@ -29,6 +28,7 @@ from dln_jax.learning.kinematics.search import ALIKE, Search, count_agreeing, se
 from dln_jax.learning.linear import design_chunks
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.models.trees import SerialTreeParameters, make_serial_tree
+from dln_jax.precision import quick_compilation
 from dln_jax.solvers import least_squares
 from dln_jax.types import InputError, Needs, require_positive
 

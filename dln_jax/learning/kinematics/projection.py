@@ -20,9 +20,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.learning.kinematics.frames import Frames, displace, free_directions
 from dln_jax.mechanics.trees.scanned import Skeleton, scanned_forces, scanned_regressor
+from dln_jax.precision import quick_compilation
 from dln_jax.types import JointKind, Vector
 
 LENGTH = 0.3

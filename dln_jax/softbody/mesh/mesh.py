@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from dln_jax.softbody.mesh.simplices import SIDES, facets, regularity, simplex_volumes
+from dln_jax.softbody.mesh.simplices import facets, regularity, simplex_volumes
 from dln_jax.types import InputError
 
 FLAT = 1e-12
@@ -144,17 +144,6 @@ def components_of_vertices(mesh: Mesh) -> Int[np.ndarray, " n"]:
     result = np.zeros(len(mesh.vertices), int)
     result[mesh.nodes] = components(mesh)[:, None]
     return result
-
-
-def boundary_vertices(mesh: Mesh) -> Int[np.ndarray, " b"]:
-    """Returns the vertices of the boundary, in ascending order."""
-    outside = boundary(mesh)
-    if mesh.midsides is None:
-        return np.unique(outside)
-    pairs = np.sort(outside[:, list(itertools.combinations(range(mesh.dimension), 2))].reshape(-1, 2), axis=1)
-    ends = np.sort(mesh.elements[:, np.array(SIDES[mesh.dimension])], axis=2)
-    number = [len(mesh.vertices), 1]
-    return np.union1d(outside, mesh.midsides[np.isin(ends @ number, pairs @ number)])
 
 
 def vertices_where(mesh: Mesh, condition: Callable[[Float[np.ndarray, "n dim"]], np.ndarray]) -> Int[np.ndarray, " k"]:

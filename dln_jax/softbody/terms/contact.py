@@ -24,12 +24,11 @@ A point mass that hits at speed u rebounds at e u, whatever its mass, k and phi 
     c u (1 + e) = ln((1 + c u) / (1 - c e u))
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.terms.penalty import penalty, penalty_force, penalty_integral
@@ -72,17 +71,6 @@ class PlaneContact(NamedTuple):
         return plane_pose(self.normal, self.offset)
 
 
-class DistanceContact(NamedTuple):
-    """Parameters of a surface with a signed distance, one for all vertices [] or one per vertex [m]."""
-
-    stiffness: Float[Array, "..."]
-    """k in N/m."""
-    friction: Float[Array, "..."] | None
-    """Coefficient of friction, or `None`."""
-    damping: Float[Array, "..."] | None = None
-    """c in s/m, or `None`."""
-
-
 class Slip(NamedTuple):
     """Friction data of one vertex, or [m, ...] of all."""
 
@@ -114,90 +102,45 @@ def plane_contact(
     differentiable. `friction` is Coulomb's coefficient, reached at the threshold speed in m/s. `damping` c in s/m
     dissipates in the normal direction (`damping_of_restitution`).
     """
+    require_positive(threshold_speed=threshold_speed)
+    if width != 0.0:
+        require_positive(width=width)
     indices = vertex_list("vertices in contact", vertices)
+    count = len(indices)
     parameters = PlaneContact(
         vector("the normal of a plane", normal, zero_allowed=False),
         jnp.asarray(offset, dtype=float),
-        *_contact_parameters(stiffness, friction, damping, len(indices)),
+        material("stiffness", stiffness, count, "vertex"),
+        *(
+            None if value is None else material(what, value, count, "vertex", NOT_NEGATIVE)
+            for what, value in (("friction", friction), ("damping", damping))
+        ),
     )
-
-    def surface(parameters: PlaneContact, x: Array) -> tuple[Array, Array]:
-        require_dimension("the normal of a plane", parameters.normal.shape[0], x.shape[1])
-        normal = parameters.normal / jnp.sqrt(jnp.sum(parameters.normal**2))
-        return jnp.broadcast_to(normal, x.shape), jnp.broadcast_to(parameters.offset, len(x))
 
     def height(x: Any, plane: tuple[Array, Array]) -> Scalar:
         return jnp.asarray(sum(plane[0][i] * coordinate for i, coordinate in enumerate(x)) - plane[1])
 
-    return _contact(name, indices, parameters, surface, height, width, threshold_speed)
-
-
-def distance_contact(
-    vertices: Indices,
-    distance: Callable[[Array], Array],
-    *,
-    stiffness: Numbers,
-    width: float,
-    friction: Numbers | None = None,
-    damping: Numbers | None = None,
-    threshold_speed: float = 1e-3,
-    name: str = "obstacle",
-) -> Term:
-    """Contact with a body inside which `distance(x [dim])`, in m, is negative; other arguments as for a plane.
-
-    The function must be twice differentiable wherever it is negative at a vertex. Friction takes the normal from its
-    gradient at the start of the step; where the gradient vanishes (the centre of a ball), there is no friction.
-    """
-    indices = vertex_list("vertices in contact", vertices)
-    parameters = DistanceContact(*_contact_parameters(stiffness, friction, damping, len(indices)))
-
-    def depth(x: Any, _: None) -> Scalar:
-        return distance(jnp.stack(x))
-
-    return _contact(name, indices, parameters, lambda *_: None, depth, width, threshold_speed)
-
-
-def _contact_parameters(stiffness: Numbers, friction: Numbers | None, damping: Numbers | None, count: int):
-    if friction is not None:
-        friction = material("friction", friction, count, "vertex", NOT_NEGATIVE)
-    if damping is not None:
-        damping = material("damping", damping, count, "vertex", NOT_NEGATIVE)
-    return material("stiffness", stiffness, count, "vertex"), friction, damping
-
-
-def _contact(
-    name: str,
-    indices: np.ndarray,
-    parameters: Any,
-    surface: Callable[[Any, Array], Any],
-    distance: Callable[[Any, Any], Scalar],
-    width: float,
-    threshold_speed: float,
-) -> Term:
-    """Builds a surface's term from its data per vertex and the distance."""
-    require_positive(threshold_speed=threshold_speed)
-    if width != 0.0:
-        require_positive(width=width)
-
-    def prepare(parameters: Any, context: Context) -> tuple[Any, Array, Slip | None, tuple[Array, Array] | None]:
+    def prepare(
+        parameters: PlaneContact, context: Context
+    ) -> tuple[tuple[Array, Array], Array, Slip | None, tuple[Array, Array] | None]:
         x = context.x[indices[:, 0]]
-        near, stiffness = surface(parameters, x), jnp.broadcast_to(parameters.stiffness, len(x))
+        require_dimension("the normal of a plane", parameters.normal.shape[0], x.shape[1])
+        normal = jnp.broadcast_to(parameters.normal / jnp.sqrt(jnp.sum(parameters.normal**2)), x.shape)
+        plane = normal, jnp.broadcast_to(parameters.offset, count)
+        stiffness = jnp.broadcast_to(parameters.stiffness, count)
         carried = x + motion_of(name, parameters, context.before, x)
         braked = slip = None
         if parameters.damping is not None:
-            braked = jax.vmap(distance)(tuple(carried.T), near), parameters.damping * stiffness / context.dt
+            braked = jax.vmap(height)(tuple(carried.T), plane), parameters.damping * stiffness / context.dt
         if parameters.friction is not None:
             lagged = x if context.lag is None else context.lag[indices[:, 0]]
-            depth, slope = jax.vmap(jax.value_and_grad(lambda x, near: distance(tuple(x), near)))(lagged, near)
-            squared = jnp.sum(slope**2, axis=1)
-            steep = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
-            force = parameters.friction * (stiffness * penalty_force(depth, width) * jnp.where(squared > 0, steep, 0.0))
-            slip = slip_of(context, threshold_speed, carried, slope / steep[:, None], force)
-        return near, stiffness, slip, braked
+            pressed = stiffness * penalty_force(jax.vmap(height)(tuple(lagged.T), plane), width)
+            slip = slip_of(context, threshold_speed, carried, normal, parameters.friction * pressed)
+        return plane, stiffness, slip, braked
 
     def energy(x: Corners, vertex: tuple[Any, Array, Slip | None, tuple[Array, Array] | None]) -> Scalar:
-        near, stiffness, slip, braked = vertex
-        depth = distance(x[0], near)
+        plane, stiffness, slip, braked = vertex
+        depth = height(x[0], plane)
         contact = stiffness * penalty(depth, width)
         if braked is not None:
             start, weight = braked

@@ -17,7 +17,7 @@ from gymnasium.wrappers import TransformReward
 
 from dln_jax.data.arrays import load_file
 from dln_jax.locomotion.environment import CreatureEnvironment
-from dln_jax.locomotion.frames import vertex_frame
+from dln_jax.locomotion.frames import Frame
 from dln_jax.locomotion.gradient import shown_walk, train
 from dln_jax.locomotion.learning import GOAL, Goal, Parameters, Policy, Record, median_to_reach
 from dln_jax.locomotion.perturbed import STEPS, numbers_of, perturbed_trials
@@ -132,7 +132,9 @@ def published_biped(
     x_c is the centre vertex, and the first row of R points from it to the forward vertex.
     """
     vertices, triangles, muscles, *weights, centre, forward = (arrays[key] for key in KEYS)
-    frame = vertex_frame(len(vertices), [int(centre), int(forward)])
+    # Origin and axis are those of two vertices.
+    at_centre, at_forward = np.eye(len(vertices))[[int(centre), int(forward)]]
+    frame = Frame(at_centre, (at_forward - at_centre)[None])
     creature = Creature("published-biped", make_mesh(vertices, triangles), muscles)
     task = make_task(creature, frame=frame, variation=variation, clock_period=0.0)
     a = vertices[int(forward)] - vertices[int(centre)]

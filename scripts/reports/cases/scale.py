@@ -17,8 +17,7 @@ from dln_jax.data.splits import Split, select
 from dln_jax.learning.dynamics import problem
 from dln_jax.models.model import make_delan
 from dln_jax.rollout import rollout
-from dln_jax.scale.mesh import batch_mesh, program, replicate, spread
-from dln_jax.scale.processes import host_devices
+from dln_jax.scale import batch_mesh, host_devices, program, replicate, spread
 from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.softbody.examples import creature_scene

@@ -14,7 +14,6 @@ import numpy as np
 
 from dln_jax import GaussNewton, Model, fit, joint_dissipation, make_delan, tree_system
 from dln_jax import load_trajectories as load
-from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.data.splits import in_blocks, select, split, with_joints
@@ -27,6 +26,7 @@ from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.metrics.coverage import LEVEL, coverage
 from dln_jax.models.model import Parameters
 from dln_jax.models.trees import make_rigid_tree
+from dln_jax.precision import quick_compilation
 from dln_jax.runs.evaluation import CHUNK, bands
 from dln_jax.scenes.datasets.generators import characters, uniform
 from dln_jax.scenes.pendulums import two_link_arm

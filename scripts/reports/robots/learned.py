@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax import Adam, GaussNewton, fit, make_delan
-from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split
 from dln_jax.learning import dynamics, objectives
@@ -27,6 +26,7 @@ from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.mechanics.trees.recursions import newton_euler
 from dln_jax.models.kernel import make_trigonometric_kernel
 from dln_jax.models.trees import make_rigid_tree, make_serial_tree
+from dln_jax.precision import quick_compilation
 from dln_jax.types import FrictionLaw, Needs
 from scripts.reports.robots.simulated_arms import Arm, lip_trajectories, panda, skew_arm, sliding_arm, waves
 from scripts.reports.run import Numbers

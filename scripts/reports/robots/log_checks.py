@@ -13,7 +13,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.data import schema
 from dln_jax.data.checks.channels import Finding
 from dln_jax.data.checks.report import quick
@@ -23,6 +22,7 @@ from dln_jax.data.robots import Robot
 from dln_jax.mechanics.trees.description import make_tree
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.mechanics.trees.recursions import newton_euler
+from dln_jax.precision import quick_compilation
 from scripts.reports.robots.simulated_arms import panda, waves
 from scripts.reports.run import Numbers
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from dln_jax.softbody.contact.crossings import crossings
 from dln_jax.softbody.contact.distances import POINT_TRIANGLE, squared_distance
-from dln_jax.softbody.mesh.mesh import Mesh, boundary, components, lumped_masses, make_mesh, vertices_where
+from dln_jax.softbody.mesh.mesh import Mesh, boundary, components, lumped_masses, vertices_where
+from dln_jax.softbody.mesh.placement import join, rotate, translate
 from dln_jax.softbody.mesh.quadratic import quadratic
 from dln_jax.softbody.mesh.shapes import box
 from scripts.reports.run import Numbers
@@ -214,11 +215,8 @@ def hitting() -> Body:
 def two_blocks(times: np.ndarray, speed: float) -> Body:
     """The upper block is smaller and turned about the vertical; surfaces repel each other from 5 mm on."""
     lower, upper = box((0.4, 0.4, 0.2), (4, 4, 2)), box((0.2, 0.2, 0.2), (3, 3, 3))
-    c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    above = (upper.vertices - [0.1, 0.1, 0.0]) @ turn.T + [0.2, 0.2, 0.206]
-    elements = np.concatenate([lower.elements, upper.elements + len(lower.vertices)])
-    mesh = make_mesh(np.concatenate([lower.vertices, above]), elements)
+    upper = translate(rotate(upper, [0.0, 0.0, np.pi / 6], about=[0.1, 0.1, 0.0]), [0.1, 0.1, 0.206])
+    mesh = join(lower, upper)
     v = np.where(np.arange(len(mesh.vertices))[:, None] >= len(lower.vertices), [0.0, 0.0, -speed], 0.0)
     held = vertices_where(mesh, lambda x: x[:, 2] == 0)
     return Body(mesh, held, 1e5, np.round(times / STEP) * STEP, near=5e-3, v=v)

@@ -15,7 +15,7 @@ from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import Split, select
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.run import export_run
-from dln_jax.export.low_latency import enable_low_latency, low_latency
+from dln_jax.export.low_latency import enable_low_latency
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
@@ -183,7 +183,6 @@ def times_of(folder: Path, dispatch: str, calls: int) -> dict[str, dict[str, flo
         )
         return {
             "low-latency-jit": times(jitted, device),
-            "low-latency-numpy": times(low_latency(jitted, *host[0], numpy=True), host),
             "c-from-python": times(load_c(place, name="model").inverse_dynamics, host),
             "c-loop": {"calls_per_second": 1e9 / min(loop.hot)},
         }

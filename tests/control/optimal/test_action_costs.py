@@ -7,35 +7,13 @@ import pytest
 from calls import one_line
 from numpy.testing import assert_allclose
 
-from dln_jax.control.optimal.action_costs import (
-    atan,
-    bang_bang,
-    bang_lin,
-    centred,
-    limited_atan,
-    logistic,
-    quadratic,
-    scaled,
-    shifted,
-    stretched,
-    tanh,
-    weighted,
-)
+from dln_jax.control.optimal.action_costs import centred, limited_atan, quadratic, stretched
 
-HALF_TURN = np.pi / 2
 COSTS = {  # cost, and its range
     "quadratic": (quadratic(0.7), -30, 30),
-    "logistic": (logistic, 0, 1),
-    "atan": (atan, -HALF_TURN, HALF_TURN),
-    "tanh": (tanh, -1, 1),
-    "bang-bang": (bang_bang, -1, 1),
-    "bang-lin": (bang_lin, -1, 1),
     "limited atan": (limited_atan(2.5, 4.0), -2.5, 2.5),
-    "shifted, then scaled and weighted": (
-        weighted(scaled(shifted(atan, -0.2), 3.0), 2.0),
-        *(3 * (0.2 + HALF_TURN * np.array([-1, 1]))),
-    ),
-    "centred": (centred(scaled(tanh, 2.0), [1.2]), -2, 2),
+    "stretched": (stretched(limited_atan(2.5, 4.0), 0.4), -1, 1),
+    "centred": (centred(limited_atan(2.0, 0.5), [1.2]), -2, 2),
 }
 W = np.array([-6.0, -1.7, -0.3, 0.2, 0.9, 8.0])
 
@@ -69,7 +47,7 @@ def test_several_controls_and_a_matrix():
     R, w = np.array([[2.0, 0.5], [0.5, 1.0]]), jnp.array([0.7, -40.0])
     assert_allclose(R @ quadratic(R).policy(w), w, rtol=1e-14)
     # Motors of different strength have a conjugate each.
-    for cost in (quadratic(R), tanh, stretched(limited_atan(1.0, 3.0), [2.0, 0.1])):
+    for cost in (quadratic(R), stretched(limited_atan(1.0, 3.0), [2.0, 0.1])):
         u = cost.policy(w)
         assert cost.cost(u) + cost.conjugate(w) == pytest.approx(float(w @ u), rel=1e-9)
     assert_allclose(jax.grad(cost.cost)(u), w, rtol=1e-6)
@@ -84,9 +62,9 @@ def test_numbers_that_make_no_cost_are_refused():
     for make, message in (
         (lambda: quadratic(-1.0), "not positive definite"),
         (lambda: quadratic([1.0, 2.0]), "symmetric matrix"),
-        (lambda: scaled(tanh, 0.0), "a is 0.0"),
-        (lambda: weighted(tanh, -1), "b is -1"),
-        (lambda: centred(scaled(tanh, 2.0), [2.5]), "cannot hold the goal"),
+        (lambda: stretched(limited_atan(1.0, 1.0), 0.0), "a is 0.0"),
+        (lambda: limited_atan(1.0, -1), "weight is -1"),
+        (lambda: centred(limited_atan(2.0, 1.0), [2.5]), "cannot hold the goal"),
         (lambda: limited_atan(np.nan, 1.0), "limit is nan"),
     ):
         with one_line(message):

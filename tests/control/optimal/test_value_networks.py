@@ -7,7 +7,7 @@ import pytest
 from calls import one_line
 from numpy.testing import assert_allclose
 
-from dln_jax.control.optimal.action_costs import quadratic, scaled, tanh
+from dln_jax.control.optimal.action_costs import limited_atan, quadratic
 from dln_jax.control.optimal.problem import (
     ControlProblem,
     at_goal,
@@ -52,7 +52,7 @@ def test_values_are_zero_at_the_goal_periodic_and_have_the_gradient_of_autodiff(
 
 
 def test_the_law_of_a_value_keeps_its_limits_and_has_no_control_where_the_state_is_not_finite():
-    problem = PROBLEM._replace(action_cost=scaled(tanh, 6.0))
+    problem = PROBLEM._replace(action_cost=limited_atan(6.0, 4.0))
     network = value_network(problem, widths=(6, 6), members=2, scale=40.0)
     parameters = network.init(jax.random.key(0))
     law = jax.jit(hjb_policy(lambda x: network.value_and_gradient(parameters, x), problem))
@@ -88,7 +88,7 @@ def test_the_equation_is_the_least_over_controls():
 
 def test_another_goal_is_held_by_a_control():
     weight = 2.0
-    push = scaled(tanh, 5.0)  # of a rod that stands at 0
+    push = limited_atan(5.0, 3.0)  # of a rod that stands at 0
     drift = lambda x: jnp.stack([x[1], weight * jnp.sin(x[0])])  # noqa: E731
     actuation = lambda x: jnp.array([[0.0], [1.0]])  # noqa: E731
     box = -HIGH[1:3], HIGH[1:3]
@@ -97,7 +97,7 @@ def test_another_goal_is_held_by_a_control():
     held = optimal_control(aside, jnp.asarray(aside.goal), jnp.zeros(2))
     assert_allclose(held, -weight * np.sin(0.4), rtol=1e-12)
     for problem, goal, message in (
-        (rod._replace(action_cost=scaled(tanh, 0.5)), [0.4, 0.0], "limits cannot hold the goal"),
+        (rod._replace(action_cost=limited_atan(0.5, 0.3)), [0.4, 0.0], "limits cannot hold the goal"),
         (rod, [0.4, 1.0], "not an equilibrium"),
         (rod, [0.4], "shape"),
     ):

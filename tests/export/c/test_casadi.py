@@ -101,7 +101,7 @@ def test_null_pointers_are_zeros_and_what_nobody_wants(library):
     Block = ctypes.POINTER(ctypes.c_double)
     A, written = np.arange(6.0), [np.full(36, np.nan) for _ in range(6)]
     arg = (Block * 5)(A.ctypes.data_as(Block))  # the others are null, and so is scale
-    wanted = 5  # dy/dscale = A b, where b is zero
+    wanted = 2  # dy/dscale = A b, where b is zero
     res = (Block * 6)(*(array.ctypes.data_as(Block) if k == wanted else None for k, array in enumerate(written)))
     assert call(arg, res, None, None, 0) == 0
     assert np.array_equal(written[wanted][:3], np.zeros(3)) and np.isnan(written[wanted][3:]).all()

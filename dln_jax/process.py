@@ -1,15 +1,26 @@
-"""Interrupts of commands: they print one word instead of a traceback, and do not break a checkpoint being stored."""
+"""The process of a command: its interrupts, standard streams and time limit.
+
+An interrupt prints one word instead of a traceback, and does not break a checkpoint being stored. `--seconds` counts
+from the start of the process until the model is stored.
+"""
 
 import contextlib
 import io
+import math
 import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
+from contextvars import ContextVar
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
+
+SOON = 1e-3
+"""Seconds that count as left after the deadline: a fit needs a positive number, and then does one dispatch."""
+_began: ContextVar[float | None] = ContextVar("began", default=None)
 
 
 def in_a_word(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
@@ -72,6 +83,30 @@ def open_standard_streams() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+
+
+@contextlib.contextmanager
+def counting_from(began: float) -> Iterator[None]:
+    """Counts the deadlines of a command from this reading of `time.perf_counter`."""
+    token = _began.set(began)
+    try:
+        yield
+    finally:
+        _began.reset(token)
+
+
+def deadline(seconds: float | None) -> float:
+    """The reading of `time.perf_counter` at which the time is up; infinite without a limit.
+
+    Outside a command the seconds count from now.
+    """
+    began = _began.get()
+    return math.inf if seconds is None else seconds + (time.perf_counter() if began is None else began)
+
+
+def seconds_left(until: float) -> float:
+    """Seconds until a deadline, `SOON` if it has passed."""
+    return max(until - time.perf_counter(), SOON)
 
 
 if is_command():

@@ -1,0 +1,128 @@
+"""Help of a command: its options in groups, as wide as the terminal; options that few need only with --help-all."""
+
+import ast
+import dataclasses
+import inspect
+import shutil
+import textwrap
+import types
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+
+import tyro
+
+GROUPS = {
+    "data": (
+        *("data", "robot", "test", "scene", "needs", "lock", "rate", "units", "joints", "topics", "torque_factor"),
+        *("cutoff", "accept_log"),
+    ),
+    "model": ("model", "width", "depth", "activation", "degree", "members", "field", "parents", "kinematic_prior"),
+    "training": (
+        *("optimizer", "objective", "steps", "epochs", "iterations", "seconds", "seed", "seeds", "batch"),
+        *("learning_rate", "samples", "target", "precision", "uncertainty"),
+    ),
+    "output": ("out", "resume", "figures", "overwrite"),
+    "devices": ("devices", "processes", "coordinator", "process_id", "compilation_cache"),
+}
+"""Options by group, for commands that have its first option; all others come first."""
+RARE = {
+    *("units", "topics", "torque_factor", "accept_log", "coordinator", "process_id", "compilation_cache"),
+    *("processes", "depth", "activation", "batch", "learning_rate", "samples", "target", "precision", "uncertainty"),
+    *("members", "box", "effort", "rough", "noise", "height", "payload_position", "vtu", "scale", "poisson_ratio"),
+    *("mixed", "youngs_modulus_of", "coupled", "velocity_scale"),
+}
+"""Options that `--help` leaves out and `--help-all` shows."""
+METAVARS = {int: "INT", float: "NUMBER", str: "TEXT", Path: "PATH"}
+COLUMN = 20
+"""Width of the column of options, characters."""
+
+
+class Option(NamedTuple):
+    """One option as the help shows it."""
+
+    name: str
+    """Name of the field."""
+    usage: str
+    """The option with a placeholder for its value, such as "--rate NUMBER"."""
+    text: str
+    """What it does, its unit and its default."""
+
+
+def help_text(arguments: type, *, prog: str, description: str, common: type | None = None, every: bool = False) -> str:
+    """Help of a command.
+
+    Args:
+        arguments: dataclass of the options; the string below a field is its text.
+        prog: the command as the user typed it.
+        description: what the command does.
+        common: dataclass of options that every command has.
+        every: whether to show all options.
+    """
+    width = max(60, min(shutil.get_terminal_size().columns, 100))
+    every_option = [option for one in (arguments, common) if one for option in options_of(one)]
+    shown = [option for option in every_option if every or option.name not in RARE]
+    paragraphs = [textwrap.fill(part, width) for part in inspect.cleandoc(description).split("\n\n")]
+    lines = [f"usage: {prog} [OPTIONS]", "", *"\n\n".join(paragraphs).split("\n")]
+    names = [option.name for option in every_option]
+    groups = {title: members for title, members in GROUPS.items() if members[0] in names}
+    own = [name for name in names if not any(name in members for members in groups.values())]
+    for title, members in {"options": own, **groups}.items():
+        if options := sorted((one for one in shown if one.name in members), key=lambda one: members.index(one.name)):
+            lines += ["", f"{title}:", *(line for option in options for line in _rows(option, width))]
+    if left := len(every_option) - len(shown):
+        lines += ["", f"{left} more options: {prog} --help-all"]
+    return "\n".join(lines)
+
+
+def options_of(arguments: type) -> list[Option]:
+    """Options of a dataclass, in its order."""
+    hints, texts, options = get_type_hints(arguments, include_extras=True), _texts(arguments), []
+    for field in dataclasses.fields(arguments):
+        marks = getattr(hints[field.name], "__metadata__", ())
+        if tyro.conf.Fixed in marks:
+            continue
+        usage, default = f"--{field.name.replace('_', '-')}", field.default
+        stated = next((mark for mark in marks if hasattr(mark, "metavar")), None)
+        kind = get_args(hints[field.name])[0] if marks else hints[field.name]
+        hint = f" (default: {default})"
+        if kind is bool:
+            usage, hint = usage if not default else f"--no-{usage[2:]}", " (default: on)" if default else ""
+        elif default is dataclasses.MISSING:
+            hint = " (required)"
+        elif default is None or (stated and stated.help_behavior_hint == ""):
+            hint = ""
+        if kind is not bool:
+            usage += f" {stated.metavar if stated and stated.metavar else _metavar(kind)}"
+        text = stated.help if stated and stated.help else texts.get(field.name, "")
+        options.append(Option(field.name, usage, text + hint))
+    return options
+
+
+def _metavar(kind: Any) -> str:
+    if get_origin(kind) in (types.UnionType, Literal) or type(kind).__name__ == "Union":
+        members = [member for member in get_args(kind) if member is not type(None)]
+        return _metavar(members[0]) if get_origin(kind) is not Literal else "{" + ",".join(map(str, members)) + "}"
+    if get_args(kind):  # annotated, or a tuple of values
+        return _metavar(get_args(kind)[0])
+    return METAVARS.get(kind, "TEXT")
+
+
+def _texts(arguments: type) -> dict[str, str]:
+    """The string below each field, also of base classes."""
+    texts = {}
+    for one in reversed([one for one in arguments.__mro__ if dataclasses.is_dataclass(one)]):
+        body = ast.parse(textwrap.dedent(inspect.getsource(one))).body[0]
+        assert isinstance(body, ast.ClassDef)
+        for field, below in zip(body.body, body.body[1:], strict=False):
+            if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
+                texts[ast.unparse(field.target)] = " ".join(str(ast.literal_eval(below.value)).split())
+    return texts
+
+
+def _rows(option: Option, width: int) -> list[str]:
+    head = textwrap.wrap(option.usage.replace(",", ", "), width, initial_indent="  ", subsequent_indent="      ")
+    head = [line.replace(", ", ",") for line in head]
+    body = textwrap.wrap(option.text, width, initial_indent=" " * COLUMN, subsequent_indent=" " * COLUMN)
+    if len(head[-1]) < COLUMN - 1 and body:
+        return [*head[:-1], f"{head[-1]:{COLUMN}}{body[0][COLUMN:]}", *body[1:]]
+    return [*head, *body]
