@@ -154,7 +154,7 @@ def train(options: Options, command: str) -> None:
         FitRefused: the model must not be used, and no limit of the user ended its training; the run folder is complete.
     """
     from dln_jax.data.parts import split_log
-    from dln_jax.learning.context import Context
+    from dln_jax.learning.engine.checkpoint import Context
     from dln_jax.learning.fit import with_uncertainty
     from dln_jax.process import deadline
     from dln_jax.runs.evaluation import evaluate

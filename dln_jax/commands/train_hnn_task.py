@@ -182,7 +182,7 @@ def main(options: Options) -> None:
     from dln_jax.commands.phase_spaces.models import choose_model, description_of
     from dln_jax.commands.phase_spaces.results import evaluate
     from dln_jax.commands.phase_spaces.training import POLYNOMIAL, train
-    from dln_jax.learning.context import Context
+    from dln_jax.learning.engine.checkpoint import Context
     from dln_jax.learning.engine.optimisers import optimiser_named
     from dln_jax.process import deadline
     from dln_jax.runs.arguments import require_positive_if_given

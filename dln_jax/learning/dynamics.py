@@ -15,6 +15,14 @@ With 15 motions, wider and deeper small networks (16 x 16, 32) reached the same 
 0.056, and a ridge did not help. A Gauss-Newton step takes about N d P² operations to form JᵀJ, and neighbouring samples
 of a motion are redundant, so a subset is enough. A small network is limited by its capacity, a large one by the
 information in the motions: the number of independent equations decides between them.
+
+`summed_with_friction` finds forces of friction that the data cannot tell apart from those of a potential.
+A potential whose slope may be any constant represents the offset of friction as well, and dry friction of a joint that
+moves one way only: torques determine their sum. A polynomial of a prismatic displacement is such a potential. A network
+of the cosine and sine of an angle becomes one if the recorded angles leave a gap in the circle.
+
+Other friction is no such gauge. Over a closed path in the states (q, qd) it takes work, and forces of a Lagrangian take
+none; terms linear in qd, A(q)ᵀ qd, only add the gyroscopic force (dA/dq - dA/dqᵀ) qd, whose power is zero.
 """
 
 from collections.abc import Sequence
@@ -30,8 +38,6 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split
 from dln_jax.learning import objectives
 from dln_jax.learning.engine import optimisers
-from dln_jax.learning.engine.checkpoint import identity
-from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Problem
 from dln_jax.learning.objectives import TORQUE, Objective
 from dln_jax.learning.uncertainty import effective_samples
@@ -47,6 +53,10 @@ ROWS_PER_PARAMETER = 14
 """Equations per parameter in a Gauss-Newton step. For 16 x 16 units, seven did equally well."""
 MOST_INDEPENDENT = 6
 """With more independent equations per parameter of the small network, a large one trained with Adam is better."""
+
+
+CIRCLE = 6.0
+"""Range of angles that leaves no gap in the circle, rad: small networks do not bridge the last 0.28 rad."""
 
 
 def problem(model: Model, sets: Split, objective: Objective = TORQUE, *, seeds: int | Sequence[int] = 0) -> Problem:
@@ -79,18 +89,6 @@ def problem(model: Model, sets: Split, objective: Objective = TORQUE, *, seeds: 
     return Problem(residual, initial(numbers), fitted, score, numbers)
 
 
-def samples(model: Model, sets: Split, objective: Objective = TORQUE) -> tuple[Array, ...]:
-    """All arrays that are read for fitting, selecting and monitoring, in the model's precision."""
-    return tuple(map(lambda *parts: jnp.concatenate(parts), *_read(model, sets, objective)[1]))
-
-
-def identity_of(
-    optimiser: Optimiser, sets: Split, objective: Objective = TORQUE, *, seeds: int | Sequence[int] = 0
-) -> dict[str, Any]:
-    """Returns the identity of a training, for `Checkpoint`."""
-    return identity(optimiser, (getattr(data, key) for data in sets for key in objective.keys), seeds=seeds)
-
-
 def validation_errors(
     model: Model, sets: Split, parameters: Parameters, objective: Objective = TORQUE
 ) -> Float[np.ndarray, " N"]:
@@ -99,8 +97,8 @@ def validation_errors(
     return np.asarray(jax.jit(lambda theta: _squares(objective, model, theta, batch, scale))(parameters))
 
 
-def suited_optimiser(model: Model, sets: Split, objective: Objective = TORQUE) -> tuple[type[Optimiser], str]:
-    """Returns the optimiser that suits the sizes of the model and the data, and the reason."""
+def suited_optimiser(model: Model, sets: Split, objective: Objective = TORQUE) -> tuple[str, str]:
+    """Returns the name of the optimiser that suits the sizes of the model and the data, and the reason."""
     return optimisers.suited(_shapes(model), len(sets.train.t), len(objective.scale(sets.train)))
 
 
@@ -137,6 +135,27 @@ def independent_equations(data: Trajectories) -> int:
     """d times the effective sample size of the accelerations (median over joints); independent of the sampling rate."""
     counts = [effective_samples(column - column.mean(), data.trajectory) for column in data.qdd.T]
     return round(data.degrees_of_freedom * float(np.median(counts)))
+
+
+def summed_with_friction(needs: Needs, data: Trajectories, *, network: bool) -> list[int]:
+    """Returns the joints, counted from 1, whose gravity and friction are known only in sum.
+
+    Args:
+        needs: the model's; gravity means a potential.
+        data: the training data.
+        network: whether the potential is a network; otherwise it is a polynomial, of cos q and sin q for angles.
+    """
+    laws = set(needs.joint_friction)
+    rates = data.qd if needs.joint_map is None else data.qd @ np.transpose(needs.joint_map)
+    one_way = np.ptp(np.sign(rates), axis=0) == 0
+    constant = ("offset" in laws) | one_way & bool(laws - {"viscous", "load"})
+    takes = (np.array(needs.joints) == "prismatic") | network & (np.ptp(data.q, axis=0) < CIRCLE)
+    return (np.flatnonzero(needs.gravity & takes & constant) + 1).tolist()
+
+
+def without_offset(needs: Needs) -> Needs:
+    """Returns the needs without the offset of friction."""
+    return needs._replace(joint_friction=tuple(law for law in needs.joint_friction if law != "offset"))
 
 
 def _shapes(model: Model) -> Parameters:

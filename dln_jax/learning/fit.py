@@ -1,6 +1,7 @@
 """The result of a fit: a model with its parameters, and how it was fitted."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +13,9 @@ import numpy as np
 
 from dln_jax.data.parts import Parts
 from dln_jax.learning import dynamics
+from dln_jax.learning.dynamics import summed_with_friction
 from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Progress, Stop, Training
-from dln_jax.learning.gauges import summed_with_friction
 from dln_jax.learning.kinematics.fit import TreeFit
 from dln_jax.learning.objectives import SCALED_TORQUE, Objective
 from dln_jax.learning.uncertainty import estimate
@@ -39,6 +40,8 @@ class Fit(Run):
     objective: Objective = SCALED_TORQUE
     optimiser: Optimiser | None = None
     """`None` for a fit without iterations of an optimiser."""
+    samples: int | None = None
+    """Number of training samples that a network draws; `None` for all."""
     seeds: int | tuple[int, ...] = 0
     """One seed, or several that trained in one program."""
     best: int = 0
@@ -81,31 +84,24 @@ class Fit(Run):
             save_uncertainty(folder, self.uncertainty, **(self.facts or {}))
 
 
-def fit_of(description: Description, needs: Needs, training: Training, best: int = 0, **how: Any) -> Fit:
-    """The fit of a description, from the training of its parameters; `how` are further fields."""
-    several = np.ndim(training.best_step) > 0
-    parameters = jax.tree.map(lambda leaf: leaf[best], training.parameters) if several else training.parameters
-    return Fit(build(description), parameters, description, needs=needs, training=training, best=best, **how)
-
-
 def direct_fit(
     description: Description,
     needs: Needs,
     parts: Parts,
     parameters: Parameters,
-    objective: Objective,
+    objective: Objective = SCALED_TORQUE,
     *,
-    loss: float,
-    seconds: float,
-    **how: Any,
+    loss: float = math.nan,
+    seconds: float = 0.0,
+    search: TreeFit | None = None,
 ) -> Fit:
     """A fit without iterations, as a training of one step."""
     model, dtype = build(description), data_type(description["precision"])
     parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), parameters)
     errors = dynamics.validation_errors(model, parts.sets, parameters, objective)
-    at = Progress(1, loss, float(np.mean(errors)), float("nan"), seconds)
+    at = Progress(1, loss, float(np.mean(errors)), math.nan, seconds)
     training = Training(parameters, [at], Stop("finished", 1), 1, 0.0)
-    return fit_of(description, needs, training, objective=objective, **how)
+    return Fit(model, parameters, description, needs=needs, training=training, objective=objective, search=search)
 
 
 def with_uncertainty(fit: Fit, parts: Parts, torque: str, say: Callable[[str], None], *, unit: Any = None) -> Fit:
@@ -121,14 +117,16 @@ def with_uncertainty(fit: Fit, parts: Parts, torque: str, say: Callable[[str], N
     if fit.properties.kernel:
         say(f"no uncertainty is stored: a {fit.name} has as many parameters as data")
         return fit
-    settings = {
-        "unit": unit,
-        "ridge": 0.0 if fit.properties.linear else None,
-        "negligible": 1e-12 if "tree" in fit.description else 0.0,
-    }
-    train, validation, _ = parts.sets
     try:
-        solution = estimate(double(fit), fit.parameters, train, validation, **settings)
+        solution = estimate(
+            double(fit),
+            fit.parameters,
+            parts.sets.train,
+            parts.sets.validation,
+            unit=unit,
+            ridge=0.0 if fit.properties.linear else None,
+            negligible=1e-12 if "tree" in fit.description else 0.0,
+        )
     except (InputError, np.linalg.LinAlgError) as error:
         # The model is trained, so an estimate that its data cannot provide is left out instead of refused.
         say(f"no uncertainty is stored: {error}")

@@ -11,7 +11,7 @@ Levenberg-Marquardt on all samples at once is for small networks, and reduces th
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ from dln_jax.learning.engine.problem import (
     Progress,
     ProgressReport,
     Training,
-    mean_square,
+    loss_of,
     selected_by,
     silent,
     unmonitored,
@@ -44,6 +44,10 @@ from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Scalar, require_positive, require_seed
 
 LOSSES = ("type1", "type2")
+MISSING = {
+    "dy": "type1 fits the gradient, but the data have no dy; add it or choose type2",
+    "d2y": "derivative 2 fits the Hessian, but the data have no d2y; add it or choose derivative 1",
+}
 WIDTHS = (2, 4, 8, 16)
 """Widths of the hidden layers, for `grow_width`."""
 GAUSS_NEWTON = GaussNewton(steps=40, coarse_steps=200, improvement=1e-7)
@@ -72,9 +76,7 @@ Targets = tuple[Array | None, ...]
 """x, y, dy and d2y of `FunctionSamples`; arrays that the loss does not read are `None` and never computed."""
 
 
-def published_adam(
-    samples: int, *, epochs: int = 500, batch: int = 512, learning_rate: float = 1e-3, weight_decay: float = 1e-6
-) -> Adam:
+def published_adam(samples: int, *, epochs: int = 500, batch: int = 512, learning_rate: float = 1e-3) -> Adam:
     """Returns the published recipe for this number of samples: a constant rate and no early stopping."""
     require_positive(epochs=epochs, batch=batch)
     steps = epochs * (samples // min(batch, samples))
@@ -82,7 +84,7 @@ def published_adam(
         steps=steps,
         batch=batch,
         learning_rate=learning_rate,
-        weight_decay=weight_decay,
+        weight_decay=1e-6,
         patience=steps,
         second_moment_decay=0.999,
         warm_up_share=0,
@@ -106,15 +108,10 @@ def targets(data: FunctionSamples, network: Network) -> Targets:
         raise InputError(f"loss is '{network.loss}'; expected one of {', '.join(LOSSES)}")
     if network.derivative not in (1, 2):
         raise InputError(f"derivative is {network.derivative}; expected 1, or 2 to fit the Hessian too")
-    dy, d2y = data.dy if network.loss == "type1" else None, data.d2y if network.derivative == 2 else None
-    if network.loss == "type1" and dy is None:
-        raise InputError("type1 fits the gradient, but the data have no dy; add it or choose type2")
-    if network.derivative == 2 and d2y is None:
-        raise InputError("derivative 2 fits the Hessian, but the data have no d2y; add it or choose derivative 1")
-    return tuple(
-        None if array is None else on_device(key, array, dtype)
-        for key, array in zip(FunctionSamples._fields, (data.x, data.y, dy, d2y), strict=True)
-    )
+    read = ["x", "y", *["dy"] * (network.loss == "type1"), *["d2y"] * (network.derivative == 2)]
+    if missing := [key for key in read if getattr(data, key) is None]:
+        raise InputError(MISSING[missing[0]])
+    return tuple(on_device(key, getattr(data, key), dtype) if key in read else None for key in FunctionSamples._fields)
 
 
 def residual(
@@ -131,11 +128,6 @@ def residual(
     return jnp.concatenate([(ours - theirs).ravel() for ours, theirs in pairs if theirs is not None])
 
 
-def mean_loss(layers: Layers, batch: Targets, *, activation: Activation) -> Scalar:
-    """Mean over samples of |r|²."""
-    return mean_square(functools.partial(residual, layers, activation=activation), batch)
-
-
 def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
     """Builds an ensemble's problem: the sum of its members' losses, or for Gauss-Newton members as seeds."""
     ours, theirs = (targets(data, network) for data in sets)
@@ -143,19 +135,18 @@ def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
     layers = differential_mlp.init_ensemble(
         jax.random.key(network.seed), sizes, members=network.members, dtype=data_type(network.precision)
     )
-    function = activation(network.activation)
-    of_member = functools.partial(mean_loss, activation=function)
+    of_sample = functools.partial(residual, activation=activation(network.activation))
+    members = selected_by(theirs, of_sample, layers, ours, jnp.full(network.members, network.seed))
+    if not together:
+        return members
+    loss = loss_of(members)
 
     def total(layers: Layers, batch: Targets) -> Scalar:
         """The sum of losses leaves every member's gradient, and so its training, the same as alone."""
         if network.members == 1:
             # An axis of one member would turn all products into batched ones, at two or three times the cost.
-            return of_member(jax.tree.map(lambda leaf: leaf[0], layers), batch)
-        return jax.vmap(lambda member: of_member(member, batch))(layers).sum()
-
-    if not together:
-        of_sample = functools.partial(residual, activation=function)
-        return selected_by(theirs, of_sample, layers, ours, jnp.full(network.members, network.seed))
+            return loss(jax.tree.map(lambda leaf: leaf[0], layers), batch)
+        return jax.vmap(loss, (0, None))(layers, batch).sum()
 
     def score(layers: Layers) -> tuple[Scalar, Scalar]:
         return unmonitored(total(layers, theirs) / network.members)
@@ -200,11 +191,10 @@ def grow_width(sets: SampleSplit, network: Network, fit: Callable[[Network], Tra
     of_sample = functools.partial(residual, activation=activation(network.activation))
 
     @jax.jit
-    def squares(layers: Layers, batch: Targets) -> Array:
-        def of_member(member: Layers) -> Array:
-            return jax.vmap(lambda *sample: jnp.sum(of_sample(member, *sample) ** 2))(*batch)
-
-        return jnp.mean(jax.vmap(of_member)(layers), axis=0)
+    @functools.partial(jax.vmap, in_axes=(None, 0))
+    def squares(layers: Layers, sample: Any) -> Array:
+        errors = jax.vmap(lambda member: of_sample(member, *sample))(layers)
+        return jnp.mean(jnp.sum(errors**2, axis=1))
 
     def fit_and_judge(candidate: Network) -> tuple[Training, Float[np.ndarray, " N"]]:
         training = fit(candidate)

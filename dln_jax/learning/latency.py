@@ -11,37 +11,30 @@ import numpy as np
 from dln_jax.data.schema import Trajectories
 from dln_jax.zoo.run import Run
 
+WARM_UP = 200
+"""Calls before those that are timed; the first compiles."""
+
 
 class Latency(NamedTuple):
-    """Wall-clock time of single calls until their results are ready, without compilation."""
+    """Percentiles of the wall-clock time of single calls until their results are ready, without compilation."""
 
-    compile_seconds: float
     p50_us: float
     p99_us: float
-    p999_us: float
-    worst_us: float
-    calls: int
 
 
-def one_step(function: Callable, states: Sequence[tuple], *, calls: int = 5000, warm_up: int = 200) -> Latency:
+def one_step(function: Callable, states: Sequence[tuple], *, calls: int = 5000) -> Latency:
     """Times calls of a compiled function, one state at a time, cycling through the states.
 
     The function is jitted, or takes NumPy arrays, and is called as `function(*state)`. All states have one shape; they
     differ, so that no result comes from a cache.
     """
-    start = time.perf_counter()
-    jax.block_until_ready(function(*states[0]))
-    compile_seconds = time.perf_counter() - start
-    for index in range(warm_up):
-        jax.block_until_ready(function(*states[index % len(states)]))
-    nanoseconds = np.empty(calls)
-    for index in range(calls):
+    nanoseconds = np.empty(WARM_UP + calls)
+    for index in range(WARM_UP + calls):
         state = states[index % len(states)]
         start = time.perf_counter_ns()
         jax.block_until_ready(function(*state))
         nanoseconds[index] = time.perf_counter_ns() - start
-    p50, p99, p999, worst = (float(time) for time in np.percentile(nanoseconds / 1e3, [50, 99, 99.9, 100]))
-    return Latency(compile_seconds, p50, p99, p999, worst, calls)
+    return Latency(*np.percentile(nanoseconds[WARM_UP:] / 1e3, [50, 99]).tolist())
 
 
 def latency_of(run: Run, data: Trajectories, *, calls: int = 5000) -> Latency:

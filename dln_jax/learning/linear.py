@@ -12,6 +12,7 @@ axis, ends at degree 0, which divides the size of the basis by 2 n + 1.
 """
 
 import functools
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -24,7 +25,7 @@ from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
-from dln_jax.learning.select import Trial, betters, select
+from dln_jax.learning.select import Trial, select, significantly_better
 from dln_jax.models.model import Model, Parameters, linearised
 from dln_jax.precision import quick_compilation
 from dln_jax.solvers import least_squares
@@ -104,21 +105,20 @@ def fit_linear(
             equations(), ridge=ridge, rank_tolerance=rank_tolerance, negligible=negligible
         )
         parameters = unravelled(solution.x, like)
-        squares = weighted = bound = 0.0
-        for columns, predicted, tau in design_chunks(linearise, parameters, data, chunk_size):
-            rounding = require_linear(columns, solution.x, predicted)
-            squares += float(np.sum((predicted - tau) ** 2))
-            weighted += float(np.sum(((predicted - tau) / scale) ** 2))
-            bound += float(np.sum((rounding / scale) ** 2))
+        parts = (
+            (predicted - tau, require_linear(columns, solution.x, predicted))
+            for columns, predicted, tau in design_chunks(linearise, parameters, data, chunk_size)
+        )
+        errors, rounding = map(np.concatenate, zip(*parts, strict=True))
         # A force that is homogeneous in its parameters passes the test per sample; only its total residual differs.
-        if not abs(weighted**0.5 - solution.residual) <= bound**0.5:
+        if not abs(np.linalg.norm(errors / scale) - solution.residual) <= np.linalg.norm(rounding / scale):
             raise InputError(_NOT_LINEAR)
     return LinearFit(
         parameters=jax.tree.map(lambda leaf, shape: jnp.asarray(leaf, shape.dtype), parameters, like),
         parameter_count=zero.size,
         rank=solution.rank,
         condition=solution.condition,
-        torque_mse=squares / len(data.tau),
+        torque_mse=float(np.mean(np.sum(errors**2, axis=1))),
         seconds=time.perf_counter() - start,
     )
 
@@ -157,9 +157,8 @@ def design_chunks(
     length = -(-samples // -(-samples // chunk_size)) if even else chunk_size
     for first in range(0, samples, length):
         # The last chunk is padded with its first sample, so that one program serves all chunks.
-        rows = np.arange(first, first + length)
-        rows[rows >= samples] = first
         last = min(first + length, samples)
+        rows = np.append(np.arange(first, last), np.full(first + length - last, first))
         columns, tau = linearise(parameters, data.q[rows], data.qd[rows], data.qdd[rows])
         yield np.asarray(columns)[: last - first], np.asarray(tau)[: last - first], data.tau[first:last]
 
@@ -190,14 +189,13 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
         size = parameters_of_degree(needs, degree)
         return size is not None and size <= min(MOST_PARAMETERS, train.tau.size)
 
-    most = next((n - 1 for n in range(2, LARGEST_DEGREE + 1) if not fits(n)), LARGEST_DEGREE)
-    sizes = [(n,) * d for n in range(1, most + 1)]
-    chosen, trials = select(sizes, fit, patience=1, stop=lambda trial: trial.validation <= target)
+    degrees = 1, *itertools.takewhile(fits, range(2, LARGEST_DEGREE + 1))
+    chosen, trials = select([(n,) * d for n in degrees], fit, patience=1, stop=lambda trial: trial.validation <= target)
     for joint in range(d if chosen.candidate[0] > 1 else 0):
         while chosen.candidate[joint] > 0:
             fewer = tuple(n - (place == joint) for place, n in enumerate(chosen.candidate))
             trials.append(Trial(fewer, *fit(fewer)))
-            if trials[-1].validation > target and betters(chosen, trials[-1]):
+            if trials[-1].validation > target and significantly_better(chosen.errors, trials[-1].errors):
                 break
             chosen = trials[-1]
     return chosen, trials

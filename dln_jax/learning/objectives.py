@@ -52,13 +52,6 @@ def torque_scale(data: Trajectories) -> Float[Array, " d"]:
     return _scale("tau", data.tau, message)
 
 
-def require_scales(data: Trajectories) -> None:
-    """Raises `InputError` if no model can be fitted to the torques: they do not vary, or numbers are far too large."""
-    for key in ("q", "qd", "qdd"):
-        spread(key, getattr(data, key))
-    torque_scale(data)
-
-
 TORQUE = Objective(
     keys=("q", "qd", "qdd", "tau"),
     scale=torque_scale,
@@ -98,21 +91,15 @@ def _both_scales(data: Trajectories) -> Float[Array, " two_d"]:
     return jnp.concatenate([torque_scale(data), _scale("qdd", data.qdd, still)])
 
 
-FORWARD = Objective(
-    keys=("q", "qd", "qdd", "tau"),
+FORWARD = SCALED_TORQUE._replace(
     scale=lambda data: _both_scales(data)[data.degrees_of_freedom :],
     residual=lambda system, q, qd, qdd, tau: dynamics(system).forward_dynamics(q, qd, tau) - qdd,
-    selects_by="scaled",
 )
 """qdd_hat(q, qd, tau) - qdd."""
 
-BOTH_WAYS = Objective(
-    keys=("q", "qd", "qdd", "tau"),
+BOTH_WAYS = SCALED_TORQUE._replace(
     scale=_both_scales,
-    residual=lambda system, q, qd, qdd, tau: jnp.concatenate(
-        [dynamics(system).inverse_dynamics(q, qd, qdd) - tau, dynamics(system).forward_dynamics(q, qd, tau) - qdd]
-    ),
-    selects_by="scaled",
+    residual=lambda *sample: jnp.concatenate([TORQUE.residual(*sample), FORWARD.residual(*sample)]),
 )
 """[tau_hat - tau, qdd_hat - qdd], in units of their standard deviations in the training samples: the loss of Lutter
 and Peters (2021, arXiv:2110.01894). It also serves models whose inverse and forward sides are different networks."""
@@ -121,23 +108,23 @@ STATED = {"inverse": TORQUE, "forward": FORWARD, "both": BOTH_WAYS}
 """Objectives that a user may select by name."""
 
 
-def objective_of(name: str, data: Trajectories, stated: str | None = None) -> Objective:
+def objective_of(name: str, data: Trajectories, stated: str | None = None, *, torque: Objective = TORQUE) -> Objective:
     """Returns the objective of a model of the catalogue; a Hamiltonian needs momenta, and otherwise fits torques.
 
     Args:
         stated: name from `STATED` that overrides the model's own objective.
+        torque: takes the place of `TORQUE`.
 
     Raises:
         InputError: only one side is selected for a model without an energy, whose other side would not be trained.
     """
     properties = CATALOGUE[name].properties
-    if stated is not None:
-        if not properties.energy and stated != "both":
-            raise InputError(f"a {name} model has no energy, so both of its sides are trained; leave --objective out")
-        return STATED[stated]
-    objective = CANONICAL if properties.canonical else TORQUE if properties.energy else BOTH_WAYS
-    complete = all(getattr(data, key) is not None for key in objective.keys)
-    return objective if complete else TORQUE
+    if stated not in (None, "both") and not properties.energy:
+        raise InputError(f"a {name} model has no energy, so both of its sides are trained; leave --objective out")
+    own = CANONICAL if properties.canonical else TORQUE if properties.energy else BOTH_WAYS
+    complete = all(getattr(data, key) is not None for key in own.keys)
+    objective = STATED[stated] if stated is not None else own if complete else TORQUE
+    return torque if objective is TORQUE else objective
 
 
 def arrays(objective: Objective, data: Trajectories, dtype: Any) -> tuple[Array, ...]:

@@ -21,13 +21,16 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.learning.engine.problem import better_of, no_best
+from dln_jax.learning.engine.problem import better_of, mean_square, no_best
 from dln_jax.learning.linear import design, unravelled
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
 from dln_jax.precision import quick_compilation
 from dln_jax.solvers import least_squares, levenberg_marquardt
 from dln_jax.types import InputError, require_positive
+
+BLOCKS = 10
+"""Parts of a recording, one of which is held out."""
 
 
 class Replay(NamedTuple):
@@ -55,32 +58,30 @@ def empty_replay(capacity: int, d: int) -> Replay:
     return Replay(motion, motion, motion, motion, weight, weight)
 
 
-def append_recording(replay: Replay, q: Any, qd: Any, qdd: Any, tau: Any, *, blocks: int = 10) -> Replay:
+def append_recording(replay: Replay, q: Any, qd: Any, qdd: Any, tau: Any) -> Replay:
     """Returns the replay with a further recording in its next empty places.
+
+    Of ten equal parts of the recording the middle one is held out, unless there are fewer samples.
 
     Args:
         q, qd, qdd, tau: the recording [n, d], in order of time.
-        blocks: number of equal parts of the recording; the middle one is held out, unless there are fewer samples.
 
     Raises:
         InputError: numbers that are not finite, arrays of other shapes, or more samples than places.
     """
-    require_positive(blocks=blocks)
-    used, arrays = replay.recorded, tuple(np.asarray(array, float) for array in (q, qd, qdd, tau))
-    capacity, d = np.shape(replay.q)
-    samples = len(arrays[0])
+    used, arrays = replay.recorded, [np.asarray(array, float) for array in (q, qd, qdd, tau)]
+    (capacity, d), samples = np.shape(replay.q), len(arrays[0])
     if any(array.shape != (samples, d) for array in arrays):
         shapes = ", ".join(str(array.shape) for array in arrays)
         raise InputError(f"q, qd, qdd and tau have shapes {shapes}; expected the same [n, {d}] for each")
-    if not all(np.isfinite(array).all() for array in arrays):
+    if not np.isfinite(arrays).all():
         raise InputError("the recording has numbers that are not finite; leave those samples out")
     if used + samples > capacity:
         raise InputError(f"the replay has {capacity - used} empty places for {samples} samples; make it larger")
-    places = slice(used, used + samples)
-    held_out = (np.arange(samples) * blocks // max(samples, 1) == blocks // 2) & (samples >= blocks > 1)
+    held_out = (np.arange(samples) * BLOCKS // max(samples, 1) == BLOCKS // 2) & (samples >= BLOCKS)
     longer = Replay(*map(np.array, replay))
     for array, rows in zip(longer, (*arrays, 1.0 - held_out, held_out), strict=True):
-        array[places] = rows
+        array[used : used + samples] = rows
     return longer
 
 
@@ -111,13 +112,13 @@ def make_refit(model: Model, *, rounds: int = 6, iterations: int = 5) -> Refit:
         unit = _scale(replay)
         fitted, held_out = (jnp.sqrt(weight)[:, None] / unit for weight in (replay.fitted, replay.held_out))
         judged = jnp.where(jnp.sum(replay.held_out) > 0, held_out, fitted)
-        samples = replay.q, replay.qd, replay.qdd, replay.tau
+        samples = replay[:4]
 
         def one_round(carry: Any, number: Array) -> tuple[Any, None]:
             state, best = carry
             state = levenberg_marquardt.run(residual, state, (*samples, fitted), iterations)
-            errors = jax.vmap(residual, in_axes=(None, 0, 0, 0, 0, 0))(state.parameters, *samples, judged)
-            return (state, better_of(best, state.parameters, jnp.sum(errors**2), number)), None
+            error = mean_square(partial(residual, state.parameters), (*samples, judged))
+            return (state, better_of(best, state.parameters, error, number)), None
 
         start = levenberg_marquardt.init(parameters), no_best(parameters)
         numbers = jnp.arange(1, rounds + 1, dtype=jnp.int32)
@@ -151,10 +152,9 @@ def make_linear_refit(model: Model) -> Refit:
 
 def _scale(replay: Replay) -> Float[Array, " d"]:
     """Standard deviations of the joints' torques in the replay; 1 for a torque that does not vary."""
-    weight = (replay.fitted + replay.held_out)[:, None]
-    count = jnp.maximum(jnp.sum(weight), 1.0)
-    mean = jnp.sum(weight * replay.tau, axis=0) / count
-    deviation = jnp.sqrt(jnp.sum(weight * (replay.tau - mean) ** 2, axis=0) / count)
+    weight = replay.fitted + replay.held_out
+    mean = jnp.average(replay.tau, axis=0, weights=weight)
+    deviation = jnp.sqrt(jnp.average((replay.tau - mean) ** 2, axis=0, weights=weight))
     return jnp.where(deviation > 0, deviation, 1.0)
 
 

@@ -6,6 +6,7 @@ With J D⁻¹ = U S Vᵀ, torque noise of variance noise_i², and a prior of var
 
     Cov(D theta) = V (S² + ridge)⁻¹ (S Uᵀ Sigma U S + ridge Sigma) (S² + ridge)⁻¹ Vᵀ,   Sigma = diag(noise_i² / unit_i²)
 
+Here torques are in the joints' units `unit_i`, so that J and r need no scale, and noise_i is relative to unit_i.
 For ridge = 0 this is the covariance of weighted least squares on the determined directions, for any weights. If all
 joints have the same Sigma it is Laplace's approximation, Sigma (JᵀJ + ridge D²)⁻¹. The degrees of freedom of joint i
 are the trace of the hat matrix over its rows:  noise_i² = sum r_i² / (N - dof_i).
@@ -18,9 +19,10 @@ import numpy as np
 from jaxtyping import Float
 
 Rows = Iterator[tuple[np.ndarray, np.ndarray]]
-"""Phi [n, d, P] and tau_hat - tau [n, d], some samples at a time."""
+"""Phi [n, d, P] and tau_hat - tau [n, d] in the joints' units, some samples at a time."""
 ALONE = 1e-6
 """Some samples alone determine a direction if the others hold less than this share of the information on it."""
+TINY = float(np.finfo(np.float64).tiny)
 
 
 class Spectrum(NamedTuple):
@@ -32,12 +34,10 @@ class Spectrum(NamedTuple):
     """S, zero for undetermined directions."""
     directions: Float[np.ndarray, "P P"]
     """V, in columns."""
-    triangles: list[np.ndarray]
-    """J_i D⁻¹ V of every joint, up to a rotation of its rows, [.., P]."""
+    triangles: Float[np.ndarray, "d r P"]
+    """J_i D⁻¹ V of every joint, up to a rotation of its rows."""
     squares: Float[np.ndarray, " d"]
-    """Sums of squared residuals of the joints, (N m)² or N²."""
-    unit: Float[np.ndarray, " d"]
-    """Scales of the fitted residuals, N m or N."""
+    """Sums of squared residuals of the joints, in their units."""
     samples: int
 
 
@@ -47,37 +47,34 @@ class Posterior(NamedTuple):
     along: Float[np.ndarray, "K r"]
     """Factor of the covariance of D theta along the directions of the spectrum."""
     noise: Float[np.ndarray, " d"]
-    """Standard deviations, N m or N."""
+    """Standard deviations, in the joints' units."""
     degrees_of_freedom: Float[np.ndarray, " d"]
 
 
-def spectrum(rows: Rows, unit: Float[np.ndarray, " d"], *, negligible: float = 0.0) -> Spectrum:
+def spectrum(rows: Rows, *, negligible: float = 0.0) -> Spectrum:
     """Computes the spectrum of all rows; takes about N d P² operations, and memory for d P² numbers.
 
     Args:
         rows: columns and residuals of the training data.
-        unit: scales of the joints' residuals in the fit.
         negligible: as for `solvers.least_squares.solve`.
     """
-    triangles: list[np.ndarray] = []
-    samples = 0
+    triangles, samples = None, 0
     for columns, residual in rows:
         samples += len(residual)
-        both = np.concatenate([columns, residual[:, :, None]], axis=2)
-        parts = [np.concatenate([*triangles[joint : joint + 1], both[:, joint]]) for joint in range(len(unit))]
-        triangles = [np.linalg.qr(part, mode="r") for part in parts]  # factors of the joints' [Phi_i r_i]
-    squares = np.array([np.sum(triangle[:, -1] ** 2) for triangle in triangles])
-    weighted = [triangle[:, :-1] / size for triangle, size in zip(triangles, unit, strict=True)]
-    P = weighted[0].shape[1]
-    norms = np.sqrt(sum(np.sum(triangle**2, axis=0) for triangle in weighted))
+        both = np.concatenate([columns, residual[:, :, None]], axis=2).swapaxes(0, 1)
+        both = both if triangles is None else np.concatenate([triangles, both], axis=1)
+        triangles = np.linalg.qr(both, mode="r")  # factors of the joints' [Phi_i r_i]
+    weighted, residuals = np.split(np.asarray(triangles), [-1], axis=2)
+    joints, _, P = weighted.shape
+    norms = np.linalg.norm(weighted, axis=(0, 1))
     seen = norms > negligible * norms.max(initial=0.0)
     scale = np.where(seen, norms, 1.0)
-    scaled = [np.where(seen, triangle, 0.0) / scale for triangle in weighted]
-    _, sizes, right = np.linalg.svd(np.linalg.qr(np.concatenate(scaled), mode="r"), full_matrices=True)
+    scaled = np.where(seen, weighted, 0.0) / scale
+    _, sizes, right = np.linalg.svd(np.linalg.qr(scaled.reshape(-1, P), mode="r"), full_matrices=True)
     sizes = np.concatenate([sizes, np.zeros(P - len(sizes))])
-    tolerance = np.finfo(np.float64).eps * max(samples * len(unit), P)
+    tolerance = np.finfo(np.float64).eps * max(samples * joints, P)
     sizes = np.where(sizes > tolerance * sizes.max(initial=0.0), sizes, 0.0)
-    return Spectrum(scale, sizes, right.T, [triangle @ right.T for triangle in scaled], squares, unit, samples)
+    return Spectrum(scale, sizes, right.T, scaled @ right.T, np.sum(residuals**2, axis=(1, 2)), samples)
 
 
 def leave_out(
@@ -94,26 +91,25 @@ def leave_out(
     Args:
         noise: standard deviations from `posterior`.
         columns: Phi D⁻¹ V of the samples.
-        residual: tau_hat - tau of the samples.
+        residual: tau_hat - tau of the samples, as all numbers here in the joints' units.
     """
-    counts, unit = spectrum.sizes > 0, spectrum.unit
-    along = columns[:, :, counts] / spectrum.sizes[counts]
-    relative = (noise / unit) ** 2
-    U = along / unit[:, None]
-    values, vectors = np.linalg.eigh(np.eye(U.shape[2]) - np.einsum("nip,niq->pq", U, U, optimize=True))
+    counts = spectrum.sizes > 0
+    U, every = (part[..., counts] / spectrum.sizes[counts] for part in (columns.swapaxes(0, 1), spectrum.triangles))
+    values, vectors = np.linalg.eigh(np.eye(U.shape[2]) - gram(U, np.ones_like(noise)))
     # A direction that only these samples determine is fitted exactly: its residual is zero and carries no information.
     inverse = (vectors * np.divide(1, values, out=np.zeros_like(values), where=values > ALONE)) @ vectors.T
-    inner = -np.einsum("nip,i,niq->pq", U, relative, U, optimize=True)
-    for size, triangle in zip(relative, spectrum.triangles, strict=True):
-        share = triangle[:, counts] / spectrum.sizes[counts]
-        inner += size * (share.T @ share)
-    weighted = residual / unit
-    predicted = U @ (inverse @ np.einsum("nip,ni->p", U, weighted))
-    variance = np.einsum("nip,pq,niq->ni", along, inverse @ inner @ inverse, along, optimize=True)
-    return (weighted + predicted) * unit, np.maximum(variance, 0.0)
+    covariance = inverse @ (gram(every, noise) - gram(U, noise)) @ inverse
+    predicted = U @ (inverse @ np.einsum("inp,ni->p", U, residual))
+    return residual + predicted.T, np.maximum(np.sum((U @ covariance) * U, axis=2), 0.0).T
 
 
-def leading_directions(rows: Callable[[], Rows], unit: Float[np.ndarray, " d"], count: int) -> Float[np.ndarray, "P K"]:
+def gram(rows: Float[np.ndarray, "d n P"], noise: Float[np.ndarray, " d"]) -> Float[np.ndarray, "P P"]:
+    """Returns the sum over joints of noise² rowsᵀ rows."""
+    weighted = (rows * noise[:, None, None]).reshape(-1, rows.shape[2])
+    return weighted.T @ weighted
+
+
+def leading_directions(rows: Callable[[], Rows], count: int) -> Float[np.ndarray, "P K"]:
     """Returns the combinations of parameters that the data determine best, for models too large for a full spectrum.
 
     Subspace iteration on D⁻¹JᵀJ D⁻¹ (Halko, Martinsson and Tropp 2011, algorithm 4.4). Phi times the result is the
@@ -121,18 +117,14 @@ def leading_directions(rows: Callable[[], Rows], unit: Float[np.ndarray, " d"], 
 
     Args:
         rows: iterates over the training data anew at every call.
-        unit: scales of the joints' residuals in the fit.
         count: K.
     """
-    squares = sum(np.sum((columns / unit[:, None]) ** 2, axis=(0, 1)) for columns, _ in rows())
+    squares = sum(np.sum(columns**2, axis=(0, 1)) for columns, _ in rows())
     scale = np.sqrt(np.where(squares > 0, squares, 1.0))
     basis = np.linalg.qr(np.random.default_rng(0).normal(size=(len(scale), count)))[0]
     for _ in range(2):
-        products = np.zeros_like(basis)
-        for columns, _residual in rows():
-            scaled = (columns / unit[:, None] / scale).reshape(-1, len(scale))
-            products += scaled.T @ (scaled @ basis)
-        basis = np.linalg.qr(products)[0]
+        scaled = ((columns / scale).reshape(-1, len(scale)) for columns, _ in rows())
+        basis = np.linalg.qr(sum(part.T @ (part @ basis) for part in scaled))[0]
     return basis / scale[:, None]
 
 
@@ -140,15 +132,13 @@ def posterior(spectrum: Spectrum, ridge: float) -> Posterior:
     """Returns the posterior for a ridge; with 0, undetermined directions have no variance."""
     counts = (spectrum.sizes > 0) | (ridge > 0)
     damped = np.sqrt(spectrum.sizes[counts] ** 2 + ridge)
-    shares = [triangle[:, counts] / damped for triangle in spectrum.triangles]
-    dof = np.array([np.sum(share**2) for share in shares])
+    shares = spectrum.triangles[..., counts] / damped
+    dof = np.sum(shares**2, axis=(1, 2))
     noise = np.sqrt(spectrum.squares / np.maximum(spectrum.samples - dof, 1.0))
-    relative = (noise / spectrum.unit) ** 2
-    inner = np.diag(relative.mean() * ridge / damped**2)
-    for size, share in zip(relative, shares, strict=True):
-        inner += size * (share.T @ share)
+    # Relative to the largest, because the variances of an exact fit are squares of rounding errors.
+    largest = max(float(noise.max(initial=0.0)), TINY)
+    relative = noise / largest
+    inner = gram(shares, relative) + np.diag(np.mean(relative**2) * ridge / damped**2)
     along = np.zeros((len(counts), int(counts.sum())))
-    # Scaled by the largest, because the variances of an exact fit are squares of rounding errors.
-    largest = max(float(relative.max(initial=0.0)), np.finfo(np.float64).tiny)
-    along[counts] = np.sqrt(largest) * np.linalg.cholesky(inner / largest) / damped[:, None]
+    along[counts] = largest * np.linalg.cholesky(inner) / damped[:, None]
     return Posterior(along, noise, dof)

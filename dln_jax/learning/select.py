@@ -6,6 +6,8 @@ samples (the one-standard-error rule of Breiman et al. 1984, paired). The rule `
 no other betters significantly.
 """
 
+import io
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -13,8 +15,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from rich.console import Console
+from rich.table import Table
 
 from dln_jax.data.schema import Trajectories
+from dln_jax.files import write_json
+from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.types import InputError
 
 SEGMENT = 0.5
@@ -27,8 +33,8 @@ class Trial(NamedTuple):
     candidate: Any
     outcome: Any
     """The fit, or the reason why there is none."""
-    errors: Float[np.ndarray, " N"] | None
-    """Squared error of every validation sample; `None` without a fit."""
+    errors: Any
+    """[N] squared error of every validation sample; `None` without a fit."""
 
     @property
     def validation(self) -> float:
@@ -41,18 +47,11 @@ def significantly_better(
     errors: Float[np.ndarray, " N"], others: Float[np.ndarray, " N"], *, margin: float = 1.0
 ) -> bool:
     """Whether `errors` are lower than `others` on average, by more than `margin` standard errors of the difference."""
-    if not np.isfinite(np.mean(errors)) or not np.isfinite(np.mean(others)):
-        return bool(np.isfinite(np.mean(errors)))
     gain = others - errors
+    if not np.isfinite(gain.mean()):
+        return bool(np.isfinite(np.mean(errors)))
     standard_error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0
     return bool(gain.mean() > margin * standard_error)
-
-
-def betters(trial: Trial, other: Trial) -> bool:
-    """Whether a trial has a fit whose errors are significantly lower than those of another, which has one too."""
-    if trial.errors is None or other.errors is None:
-        return False
-    return significantly_better(trial.errors, other.errors)
 
 
 def lowest(trials: Sequence[Trial]) -> Trial:
@@ -63,7 +62,7 @@ def lowest(trials: Sequence[Trial]) -> Trial:
 def simplest(trials: Sequence[Trial]) -> Trial:
     """Returns the first trial whose error no other betters significantly."""
     best = lowest(trials)
-    return next(trial for trial in trials if not betters(best, trial))
+    return next(trial for trial in trials if not significantly_better(best.errors, trial.errors))
 
 
 def select(
@@ -94,10 +93,8 @@ def select(
         trial = Trial(candidate, *fit(candidate))
         trials.append(trial)
         if trial.errors is not None:
-            if best is None or significantly_better(trial.errors, best):
-                best, waited = trial.errors, 0
-            else:
-                waited += 1
+            better = best is None or significantly_better(trial.errors, best)
+            best, waited = (trial.errors, 0) if better else (best, waited + 1)
             if waited >= patience or stop(trial):
                 break
         if best is not None and time.perf_counter() >= until:
@@ -121,6 +118,31 @@ def segments(data: Trajectories, seconds: float = SEGMENT) -> Int[np.ndarray, " 
 def mean_of_segments(data: Trajectories, errors: Float[np.ndarray, "N ..."]) -> Float[np.ndarray, "S ..."]:
     """Means of samples' errors over their time segments."""
     numbers = segments(data)
-    counts = np.bincount(numbers)
-    means = [np.bincount(numbers, column) / counts for column in errors.reshape(len(errors), -1).T]
-    return np.stack(means, axis=1).reshape(len(counts), *errors.shape[1:])
+    sums = np.zeros((numbers.max() + 1, *errors.shape[1:]))
+    np.add.at(sums, numbers, errors)
+    return (sums.T / np.bincount(numbers)).T
+
+
+def say_selection(context: Context, title: str, kept: str, ended: str, rows: Sequence[dict[str, Any]]) -> None:
+    """Says a table of the candidates, and why the selection ended; writes both into the run's folder.
+
+    Args:
+        kept: name of the kept candidate.
+        ended: why no further candidate was tried; empty if all were.
+        rows: a dictionary for each candidate, with its `name`; lists and texts are not shown.
+    """
+    shown = [key for key in dict.fromkeys(itertools.chain(*rows)) if key not in ("name", "joints", "reason")]
+    table = Table("model", *(key.replace("_", " ") for key in shown), "", title=title)
+    for row in rows:
+        values = (row.get(key) for key in shown)
+        numbers = [
+            f"{value:.3g}" if isinstance(value, float) else "" if value is None else f"{value}" for value in values
+        ]
+        table.add_row(row["name"], *numbers, "kept" if row["name"] == kept else "")
+    text = io.StringIO()
+    Console(file=text, highlight=False, soft_wrap=True).print(table)
+    context.say(text.getvalue().rstrip())
+    if ended:
+        context.say(f"no further model was tried: {ended}")
+    if context.folder is not None:
+        write_json(context.folder / "selection.json", {"kept": kept, "ended": ended, "candidates": list(rows)})

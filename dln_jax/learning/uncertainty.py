@@ -34,7 +34,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select, select_samples
 from dln_jax.learning.linear import design, design_chunks
 from dln_jax.learning.objectives import torque_scale
-from dln_jax.learning.posterior import Posterior, Rows, Spectrum, leading_directions, leave_out, posterior, spectrum
+from dln_jax.learning.posterior import TINY, Posterior, Rows, leading_directions, leave_out, posterior, spectrum
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.uncertainty import Domain, Uncertainty
 from dln_jax.solvers.normal_equations import count
@@ -56,7 +56,6 @@ CHUNK = 256
 """Samples per call of the program that linearises the model."""
 UPPER = 0.975
 """Quantile of a two-sided 95 % band; `scatter` uses it to widen bands from few motions."""
-TINY = np.finfo(np.float64).tiny
 
 
 class Estimate(NamedTuple):
@@ -103,40 +102,59 @@ def estimate(
     if ridge is not None and not 0 <= ridge < np.inf:
         raise InputError(f"ridge is {ridge}; expected a number >= 0, or None to choose it by validation")
     with jax.enable_x64(True):
-        unit = np.asarray(torque_scale(train) if unit is None else unit, np.float64)
+        spread = np.asarray(torque_scale(train), np.float64)
+        unit = spread if unit is None else np.asarray(unit, np.float64)
         parameters = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), parameters)
         if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(parameters)):
             raise InputError("the parameters are not finite; train again")
-        held_out = thin(validation, MOST_SAMPLES)
-        if ridge == 0 or count(parameters) <= MOST_PARAMETERS:
-            basis = None
-        else:
-            basis = leading_directions(lambda: _rows(model, parameters, thin(train, MOST_SAMPLES)), unit, DIRECTIONS)
-        known = spectrum(_rows(model, parameters, train, basis), unit, negligible=negligible)
-        fitted = _along(known, _rows(model, parameters, thin(train, MOST_SAMPLES), basis))[0]
-        judged, residual = _along(known, _rows(model, parameters, held_out, basis))
-        folds = [] if ridge != 0 else _leave_out(model, parameters, train, known)
-    tried = []
-    for size in RIDGES if ridge is None else (ridge,):
-        of_ridge = posterior(known, size)
-        noise, inflation, unlikeliness = _calibrate(of_ridge, judged, residual, held_out.trajectory, folds)
-        tried.append((unlikeliness, size, of_ridge, noise, inflation))
-    _, chosen, fit, noise, inflation = min(tried, key=lambda calibrated: calibrated[0])
-    along = fit.along
-    limits = np.concatenate([np.linalg.norm(part @ along, axis=2) for part in (fitted, judged)])
-    factor, scale = (known.directions @ along) / known.scale[:, None], known.scale
-    undetermined = known.directions[:, known.sizes == 0] if chosen == 0 else np.zeros((len(scale), 0))
+        held_out, some = (thin(data, MOST_SAMPLES) for data in (validation, train))
+
+        basis: np.ndarray | None = None
+
+        def rows(data: Trajectories) -> Rows:
+            for columns, tau, measured in design_chunks(design(model), parameters, data, CHUNK, even=False):
+                columns = columns / unit[:, None]
+                yield columns if basis is None else columns @ basis, (tau - measured) / unit
+
+        if ridge != 0 and count(parameters) > MOST_PARAMETERS:
+            basis = leading_directions(lambda: rows(some), DIRECTIONS)
+        known = spectrum(rows(train), negligible=negligible)
+
+        def along(data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
+            """Phi D⁻¹ V [N, d, P] and the residuals [N, d] of some data."""
+            columns, residuals = map(np.concatenate, zip(*rows(data), strict=True))
+            return columns / known.scale @ known.directions, residuals
+
+        (fitted, _), (judged, residual) = along(some), along(held_out)
+        folds, present = [], np.unique(train.trajectory)
+        if ridge == 0 and len(present) > 1:  # training data as if held out, a fold of trajectories at a time
+            sd = posterior(known, 0.0).noise
+            parts = (select(train, indices) for indices in np.array_split(present, min(FOLDS, len(present))))
+            folds = [(*leave_out(known, sd, *along(part)), part.trajectory) for part in parts]
+
+    def calibrated(size: float) -> tuple[float, float, Posterior, np.ndarray, np.ndarray]:
+        fit = posterior(known, size)
+        variances = np.sum((judged @ fit.along) ** 2, axis=2)
+        parts = zip((residual, variances, held_out.trajectory), *folds, strict=True)
+        noise, inflation, unlikeliness = _calibrate(fit.noise, *map(np.concatenate, parts))
+        return unlikeliness, size, fit, noise, inflation
+
+    _, chosen, fit, noise, inflation = min(map(calibrated, RIDGES if ridge is None else (ridge,)), key=lambda of: of[0])
+    limits = unit * np.concatenate([np.linalg.norm(part @ fit.along, axis=2) for part in (fitted, judged)])
+    factor, scale = (known.directions @ fit.along) / known.scale[:, None], known.scale
+    undetermined = known.directions[:, (known.sizes == 0) & (chosen == 0)]
     if basis is not None:
         factor, scale, undetermined = basis @ factor, np.ones(len(basis)), np.zeros((len(basis), 0))
     limit = np.maximum(margin * np.quantile(limits, quantile, axis=0), TINY)
-    share = HARMLESS if ridge == 0 else 0.0
-    harmless = share * np.asarray(torque_scale(train), np.float64) / np.sqrt(np.maximum(inflation, TINY))
+    harmless = (HARMLESS if ridge == 0 else 0.0) * spread / np.sqrt(np.maximum(inflation, TINY))
     states, others = (np.concatenate([data.q, data.qd, data.qdd], axis=1) for data in (train, validation))
     centre = (states.max(axis=0) + states.min(axis=0)) / 2
     reach = np.quantile(abs(np.concatenate([states, others]) - centre), quantile, axis=0)
     reach = np.maximum(margin * reach, STILL)
     domain = Domain(np.maximum(limit, harmless), scale, undetermined, centre, reach, harmless)
-    return Estimate(Uncertainty(factor, noise, inflation, domain), chosen, fit.degrees_of_freedom, fit.noise)
+    return Estimate(
+        Uncertainty(factor, unit * noise, inflation, domain), chosen, fit.degrees_of_freedom, unit * fit.noise
+    )
 
 
 def calibration(
@@ -154,9 +172,8 @@ def calibration(
     relative = np.maximum(noise**2 + ratios * variance, TINY)
     factors = np.maximum(np.mean(residual**2 / relative, axis=1), TINY)
     both = 0.5 + 0.5 * (np.log(factors) + np.mean(np.log(relative), axis=1))
-    one = int(np.argmin(abs(ratios - 1)))
-    best = int(np.argmin(both))
-    unscaled = 0.5 * float(np.mean(residual**2 / relative[one] + np.log(relative[one])))
+    one, best = RATIOS.index(1.0), int(np.argmin(both))
+    unscaled = both[one] + 0.5 * (factors[one] - 1 - np.log(factors[one]))
     further = 0.5 * np.log(max(samples, 2.0)) / max(samples, 1.0)
     candidates = [
         (unscaled, unscaled, 1.0, 1.0),
@@ -205,11 +222,11 @@ def effective_samples(residual: Float[np.ndarray, " N"], trajectory: np.ndarray)
     The sum ends at the first lag whose autocorrelation is below 0.05 (Bayley and Hammersley 1946, for the squares).
     """
     order = np.argsort(trajectory, kind="stable")
-    parts = np.split(residual[order], np.flatnonzero(np.diff(trajectory[order])) + 1)
-    whole = sum(float(part @ part) for part in parts)
-    total = 1.0
-    for lag in range(1, max(map(len, parts))):
-        correlation = sum(float(part[lag:] @ part[:-lag]) for part in parts if len(part) > lag) / max(whole, 1e-300)
+    residual, trajectory = residual[order], trajectory[order]
+    whole, total = max(float(residual @ residual), 1e-300), 1.0
+    for lag in range(1, len(residual)):
+        same = trajectory[lag:] == trajectory[:-lag]
+        correlation = float(residual[lag:][same] @ residual[:-lag][same]) / whole
         if not correlation >= 0.05:
             break
         total += 2 * correlation**2
@@ -223,48 +240,14 @@ def thin(data: Trajectories, most: int) -> Trajectories:
 
 
 def _calibrate(
-    fitted: Posterior,
-    rows: np.ndarray,
-    residual: np.ndarray,
-    trajectory: np.ndarray,
-    folds: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    sd: np.ndarray, residual: np.ndarray, variances: np.ndarray, trajectory: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Calibrated noise and inflation of every joint, and the mean negative log-likelihood."""
-    variances = np.sum((rows @ fitted.along) ** 2, axis=2)
-    parts = zip((residual, variances, trajectory), *folds, strict=True)
-    residual, variances, trajectory = (np.concatenate(part) for part in parts)
     joints = [
         calibration(r, float(noise), variance, effective_samples(r / np.sqrt(noise**2 + variance), trajectory))
-        for r, noise, variance in zip(residual.T, fitted.noise, variances.T, strict=True)
+        for r, noise, variance in zip(residual.T, sd, variances.T, strict=True)
     ]
     a, b, unlikeliness = np.array(joints).T
-    expected = np.maximum(a * fitted.noise**2 + b * variances, TINY)
+    expected = np.maximum(a * sd**2 + b * variances, TINY)
     factors = np.array([scatter(relative, trajectory) for relative in (residual / np.sqrt(expected)).T])
-    return np.sqrt(factors * a) * fitted.noise, factors * b, float(unlikeliness.mean())
-
-
-def _leave_out(
-    model: Model, parameters: Parameters, train: Trajectories, known: Spectrum
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Residuals, variances and trajectories of training data as if held out, a fold of trajectories at a time."""
-    noise, present = posterior(known, 0.0).noise, np.unique(train.trajectory)
-    if len(present) < 2:
-        return []
-    folds = []
-    for indices in np.array_split(present, min(FOLDS, len(present))):
-        data = select(train, indices)
-        columns, residual = _along(known, _rows(model, parameters, data))
-        folds.append((*leave_out(known, noise, columns, residual), data.trajectory))
-    return folds
-
-
-def _rows(model: Model, parameters: Parameters, data: Trajectories, basis: np.ndarray | None = None) -> Rows:
-    for columns, tau, measured in design_chunks(design(model), parameters, data, CHUNK, even=False):
-        yield columns if basis is None else columns @ basis, tau - measured
-
-
-def _along(known: Spectrum, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
-    """Phi D⁻¹ V [N, d, P] and the residuals [N, d] of some data."""
-    parts = [(columns / known.scale @ known.directions, residual) for columns, residual in rows]
-    columns, residuals = zip(*parts, strict=True)
-    return np.concatenate(columns), np.concatenate(residuals)
+    return np.sqrt(factors * a) * sd, factors * b, float(unlikeliness.mean())

@@ -41,7 +41,7 @@ class Dynamics(NamedTuple):
     """(q, qd=None) -> M [d, d], by default at qd = 0; M of a natural system depends on q alone, others also on qd."""
     decompose: Callable[[VectorLike, VectorLike, VectorLike], Decomposition]
     """(q, qd, qdd) -> inertial, Coriolis and gravity forces, without friction. Data may determine gravity and friction
-    only in sum (`learning.gauges`)."""
+    only in sum (`learning.dynamics`)."""
     friction: Callable[[VectorLike, VectorLike], Array]
     """(q, qd) -> friction force dD/dqd [d]; zero without friction."""
 

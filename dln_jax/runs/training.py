@@ -12,7 +12,7 @@ from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, select_samples
 from dln_jax.data.stated_needs import needs_from_json
-from dln_jax.learning.context import Context
+from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.learning.fit import Fit, with_uncertainty
 from dln_jax.learning.fits.settings import WAYS
 from dln_jax.precision import require_double_precision

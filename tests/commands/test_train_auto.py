@@ -15,8 +15,8 @@ from dln_jax.data.log import read_log
 from dln_jax.data.parts import split_log
 from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import Robot
-from dln_jax.learning.context import Context
-from dln_jax.learning.fits import automatic, tree
+from dln_jax.learning.engine.checkpoint import Context
+from dln_jax.learning.fits import automatic, direct
 from dln_jax.learning.fits.settings import Automatic
 
 TREE = "--model learned-tree --data rigid.npz"
@@ -81,7 +81,7 @@ def test_a_kinematic_prior_and_parents_reach_the_search(workplace, capsys, monke
         seen.update(parents=tuple(parents), scale=velocity_scale, **settings._asdict())
         raise InputError("seen")
 
-    monkeypatch.setattr(tree, "fit_tree", searched)
+    monkeypatch.setattr(direct, "fit_tree", searched)
     options = "--kinematic-prior prior.json --parents 0,1 --out near --needs"
     assert "seen" in refused(capsys, train_delan, TREE, options, PLAIN.replace("]}", '], "velocity_scale": 0.02}'))
     assert seen["parents"] == (-1, 0) and seen["scale"] == 0.02

@@ -1,5 +1,7 @@
 """Samples of functions: the published noise, exact grids, refusals, units, and the residuals that read them."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +15,8 @@ from dln_jax.commands.functions.units import layers_in_own_units, standard_units
 from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples, published, published_grid
 from dln_jax.learning import functions as regression
-from dln_jax.learning.functions import Network, mean_loss, published_adam, targets
+from dln_jax.learning.engine.problem import mean_square
+from dln_jax.learning.functions import Network, published_adam, residual, targets
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import cos, tanh
 
@@ -109,11 +112,11 @@ def test_an_exact_model_has_no_loss_and_a_wrong_one_that_of_its_terms():
     for loss, derivative in (("type1", 1), ("type1", 2), ("type2", 2)):
         grid = published_grid("sin")
         batch = targets(grid, Network(loss=loss, derivative=derivative, precision="f64"))
-        assert float(mean_loss(SINE, batch, activation=cos)) < 1e-30
+        assert float(mean_square(partial(residual, SINE, activation=cos), batch)) < 1e-30
         double = (SINE[0], (2 * SINE[1][0], SINE[1][1]))
         read = [grid.y, *([grid.dy] if loss == "type1" else []), *([grid.d2y] if derivative == 2 else [])]
         expected = sum(np.mean(each**2) for each in read)
-        assert_allclose(mean_loss(double, batch, activation=cos), expected, rtol=1e-12)
+        assert_allclose(mean_square(partial(residual, double, activation=cos), batch), expected, rtol=1e-12)
 
 
 def test_a_network_of_standard_units_is_the_same_in_the_users_units():

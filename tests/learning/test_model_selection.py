@@ -33,7 +33,9 @@ def candidate(*shares):
 
 def compared(validation=VALIDATION, **more):
     """The kept candidate, what is told of each, and why the comparison ended."""
-    kept, rows, ended = compare(more.pop("candidates"), TRAIN, validation, **more)
+    usual = {"noise": np.nan, "until": np.inf, "definite": lambda model: True, "beside": lambda model: None}
+    candidates, more = more.pop("candidates"), {**usual, "say": lambda line: None, **more}
+    kept, rows, ended = compare(candidates, TRAIN, validation, **more)
     return kept.candidate, rows, ended
 
 

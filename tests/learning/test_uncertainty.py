@@ -124,7 +124,7 @@ def test_leading_directions_are_those_of_the_singular_value_decomposition(monkey
     random = np.random.default_rng(0)
     Phi = random.normal(size=(60, 1, 12)) * 10.0 ** -np.arange(12) @ np.linalg.qr(random.normal(size=(12, 12)))[0]
     unit = np.array([2.0])
-    found = leading_directions(lambda: iter([(Phi[:40], 0), (Phi[40:], 0)]), unit, 3)
+    found = leading_directions(lambda: iter([(Phi[:40] / unit, 0), (Phi[40:] / unit, 0)]), 3)
     scaled = Phi[:, 0] / np.linalg.norm(Phi[:, 0] / unit, axis=0)
     _, _, right = np.linalg.svd(scaled, full_matrices=False)
     basis = found * np.linalg.norm(Phi[:, 0] / unit, axis=0)[:, None]
@@ -137,7 +137,7 @@ def test_leading_directions_are_those_of_the_singular_value_decomposition(monkey
 def test_the_covariance_is_that_of_bayes_where_all_joints_are_alike():
     random = np.random.default_rng(0)
     Phi, residual = random.normal(size=(50, 1, 6)), random.normal(size=(50, 1))
-    found = spectrum(iter([(Phi[:20], residual[:20]), (Phi[20:], residual[20:])]), np.array([1.0]))
+    found = spectrum(iter([(Phi[:20], residual[:20]), (Phi[20:], residual[20:])]))
     gram = Phi[:, 0].T @ Phi[:, 0]
     for ridge in (0.0, 0.1):
         of = posterior(found, ridge)

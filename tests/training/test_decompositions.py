@@ -15,9 +15,10 @@ from dln_jax.data import schema
 from dln_jax.data.log import read_log
 from dln_jax.data.parts import split_log
 from dln_jax.data.schema import from_arrays
+from dln_jax.learning.dynamics import summed_with_friction
+from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.learning.fits.network import plan_network
 from dln_jax.learning.fits.settings import Network
-from dln_jax.learning.gauges import summed_with_friction
 from dln_jax.mechanics import lagrangian
 from dln_jax.mechanics.friction import USUAL
 from dln_jax.scenes.datasets.generators import characters
@@ -72,7 +73,7 @@ def test_friction_beside_the_potential_of_a_network_has_no_offset(workplace):
     for needs, laws in ((None, ("viscous", "coulomb")), (weightless, USUAL)):
         log = read_log(LETTERS, needs=needs)
         parts = split_log(log)
-        plan = plan_network(Network(), log, parts, 0)
+        plan = plan_network(Network(), log, parts, Context())
         assert (
             plan.needs.joint_friction == laws and summed_with_friction(plan.needs, parts.sets.train, network=True) == []
         )

@@ -20,14 +20,13 @@ from dln_jax.commands.phase_spaces.training import (
 from dln_jax.data.bodies import Order, arrangements
 from dln_jax.data.schema import column
 from dln_jax.data.splits import hold_out
-from dln_jax.learning.context import Context
+from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import loss_of
 from dln_jax.learning.matching import match_linear
 from dln_jax.learning.objectives import TORQUE
-from dln_jax.learning.select import mean_of_segments, select
-from dln_jax.learning.selection import say_selection
+from dln_jax.learning.select import mean_of_segments, say_selection, select
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE, entry_of
 from dln_jax.zoo.descriptions import Description, build, describe_for

@@ -13,8 +13,7 @@ import numpy as np
 from dln_jax.commands.phase_spaces.data import ANCHOR, PhaseLog, spreads
 from dln_jax.data.schema import Trajectories, column
 from dln_jax.data.splits import PER_SAMPLE, hold_out
-from dln_jax.learning.context import Context
-from dln_jax.learning.engine.checkpoint import identity
+from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser
 from dln_jax.learning.engine.problem import Problem, Progress, Training, losses, one_after_the_other
@@ -170,12 +169,12 @@ def train(
         elif stage == MOTIONS:
             # One iteration per dispatch, so that the time limit is kept and validation judges every iteration.
             own = own._replace(improvement=FLAT, steps_per_dispatch=1)
-        known = identity(own, numbers, model=description, seed=seed, samples=task.samples)
+        known = {"model": description, "seed": seed, "samples": task.samples}
         with context.progress(own.steps) as show:
             return fit(
                 problem,
                 own,
-                checkpoint=context.checkpoint(known, f"checkpoint_{stage}"),
+                checkpoint=context.checkpoint(f"checkpoint_{stage}", own, numbers, **known),
                 report=lambda at: show(at.step, f"{stage}: {losses(at)}"),
                 seconds=context.seconds,
                 must_start=must_start,

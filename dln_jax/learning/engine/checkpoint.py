@@ -1,18 +1,22 @@
-"""Stores runs so that they can continue, and identifies them."""
+"""What a fit needs of the run that it belongs to, and how it stores a training so that it can continue."""
 
 import hashlib
 import math
-from collections.abc import Iterable
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 
 from dln_jax.files import finite, is_file
 from dln_jax.learning.engine.optimisers import Optimiser
-from dln_jax.learning.engine.problem import Progress
+from dln_jax.learning.engine.problem import Progress, plain
+from dln_jax.process import seconds_left
 from dln_jax.types import InputError
 from dln_jax.zoo import parameter_files as checkpoints
 
@@ -35,19 +39,53 @@ class Checkpoint(NamedTuple):
     name: str = CHECKPOINT
 
 
+@contextmanager
+def no_progress(total: int) -> Iterator[Callable[[int, str], None]]:
+    """Yields a `show(done, text)` that shows nothing."""
+    yield lambda done, text: None
+
+
+class Context(NamedTuple):
+    """The run of a fit; by default none: nothing is printed or stored."""
+
+    seed: int = 0
+    """Seed of parameters and shuffling."""
+    until: float = math.inf
+    """Reading of `time.perf_counter` at which a fit stops."""
+    say: Callable[[str], None] = lambda line: None
+    """Takes lines for the user."""
+    progress: Callable[[int], AbstractContextManager[Callable[[int, str], None]]] = no_progress
+    """Total -> context of `show(done, text)`."""
+    folder: Path | None = None
+    """Folder of checkpoints and candidates."""
+    resume: bool = False
+    """Continue from what the folder holds."""
+    mesh: Mesh | None = None
+    """Devices that share a fit."""
+
+    @property
+    def seconds(self) -> float:
+        """Seconds left for fits."""
+        return seconds_left(self.until)
+
+    def within(self, seconds: float) -> "Context":
+        """The context of a fit that has at most these seconds."""
+        return self._replace(until=min(self.until, time.perf_counter() + seconds))
+
+    def checkpoint(
+        self, name: str, optimiser: Optimiser, arrays: Iterable[np.ndarray | Array | None], **settings: Any
+    ) -> Checkpoint | None:
+        """Where a training with this identity is stored; `None` without a folder."""
+        if self.folder is None:
+            return None
+        return Checkpoint(self.folder, identity(optimiser, arrays, **settings), self.resume, name)
+
+
 def identity(optimiser: Optimiser, arrays: Iterable[np.ndarray | Array | None], **settings: Any) -> dict[str, Any]:
-    """Returns the identity of a run: optimiser, data fingerprint, settings, but not the time limit, which may grow."""
+    """Returns the identity of a run: optimiser, settings and the SHA-256 of its arrays; a time limit may grow."""
     stated = {"optimiser": type(optimiser).__name__, **optimiser._asdict(), **settings}
-    return {"settings": stated, "data": fingerprint(arrays)}
-
-
-def fingerprint(arrays: Iterable[np.ndarray | Array | None]) -> str:
-    """Returns the SHA-256 of a run's arrays; a resumed run uses it to recognise its data."""
-    digest = hashlib.sha256()
-    for array in arrays:
-        if array is not None:
-            digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+    data = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays if array is not None)
+    return {"settings": stated, "data": hashlib.sha256(data).hexdigest()}
 
 
 def store(checkpoint: Checkpoint, state: Any, history: list[Progress]) -> None:
@@ -76,7 +114,11 @@ def restore(checkpoint: Checkpoint | None, like: Any) -> tuple[Any, list[Progres
             )
     state = checkpoints.load_tree(checkpoint.directory, checkpoint.name, like)
     path = checkpoint.directory / f"{checkpoint.name}.json"
-    return state, [Progress(*map(_number, row)) for row in stored_rows(path, manifest, "history", Row)]
+    rows = stored_rows(path, manifest, "history", Row)
+    return state, [
+        Progress._make([plain(step), *(plain(np.array(value, float)) for value in values), seconds, stage])
+        for step, *values, seconds, stage in rows
+    ]
 
 
 def stored_rows(path: Path, manifest: dict[str, Any], key: str, row: Any) -> list[Any]:
@@ -92,7 +134,7 @@ def stored_rows(path: Path, manifest: dict[str, Any], key: str, row: Any) -> lis
         rows = msgspec.convert(manifest.get(key), list[row])
     except msgspec.ValidationError as error:
         raise InputError(f"{path}: {key} is damaged ({error}); {checkpoints.REMEDY}") from error
-    if any([np.shape(value) for value in values] != [np.shape(value) for value in rows[0]] for values in rows):
+    if len({tuple(map(np.shape, values)) for values in rows}) > 1:
         raise InputError(f"{path}: {key} has rows of different shapes; {checkpoints.REMEDY}")
     return rows
 
@@ -100,9 +142,3 @@ def stored_rows(path: Path, manifest: dict[str, Any], key: str, row: Any) -> lis
 def has_checkpoint(directory: Path, name: str = CHECKPOINT) -> bool:
     """Whether this folder holds a checkpoint of a run."""
     return is_file(directory / f"{name}.json")
-
-
-def _number(value: Any) -> Any:
-    if isinstance(value, list):
-        return np.array([_number(element) for element in value])
-    return math.nan if value is None else value

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
-from dln_jax.learning.engine import descent, newton, optimisers
+from dln_jax.learning.engine import newton, optimisers
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.optimisers import Adam, Optimiser
 from dln_jax.learning.engine.problem import (
@@ -67,7 +67,7 @@ def fit(
     optimisers.check(optimiser)
     shared = sharing(problem, mesh)
     if isinstance(optimiser, Adam):
-        stages = descent.stages(problem, optimiser, shared)
+        stages = optimisers.stages(problem, optimiser, shared)
     else:
         stages = newton.stages(problem, optimiser, shared)
     run = _Run(stages[0].start(None), jnp.asarray(0))

@@ -57,10 +57,7 @@ def stages(problem: Problem, optimiser: GaussNewton, shared: Sharing) -> list[St
     arrays = jax.tree.map(jnp.asarray, problem.arrays)
     settings = {"improvement": optimiser.improvement, "mesh": shared.samples}
     iterate = functools.partial(levenberg_marquardt.run_on_chunks, problem.residual, **settings)
-
-    def stage(name: str, arrays: Arrays, iterations: int) -> Stage:
-        return _stage(problem, optimiser, shared, iterate, name, arrays, iterations)
-
+    stage = functools.partial(_stage, problem, optimiser, shared, iterate)
     if not optimiser.has_coarse_stage(len(arrays[0])):
         return [stage("", arrays, optimiser.steps)]
     some = jax.tree.map(lambda array: array[: optimiser.coarse_samples], arrays)

@@ -1,11 +1,33 @@
-"""The optimisers of `fit`, as records of all their settings, and the choice between them."""
+"""The optimisers of `fit`: their settings, the choice between them, and Adam as a stage of a run.
+
+A dispatch of Adam runs whole epochs in one loop on the device, with on-device shuffling; the best parameters are chosen
+by validation. The permutation of an epoch depends only on the run's key and the epoch's number, so a resumed run takes
+exactly the steps of an uninterrupted one.
+"""
 
 import math
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import optax
+from jax import Array
 
+from dln_jax.learning.engine.problem import (
+    Best,
+    Dispatch,
+    Problem,
+    Sharing,
+    Stage,
+    Stop,
+    better_of,
+    by_devices,
+    loss_of,
+    no_best,
+)
 from dln_jax.precision import require_float64
+from dln_jax.scale import first, mean, share, shares
 from dln_jax.solvers.levenberg_marquardt import CHUNK
 from dln_jax.solvers.normal_equations import count, jacobian_bytes
 from dln_jax.types import InputError, require_positive
@@ -71,20 +93,52 @@ class GaussNewton(NamedTuple):
 
 
 Optimiser = Adam | GaussNewton
+NAMES: dict[str, type[Optimiser]] = {"adam": Adam, "gauss-newton": GaussNewton}
+POSITIVE = ("steps", "steps_per_dispatch", "coarse_samples", "batch", "patience", "learning_rate")
 
 
 def check(optimiser: Optimiser) -> None:
     """Raises `InputError` for settings out of range."""
-    require_positive(steps=optimiser.steps, steps_per_dispatch=optimiser.steps_per_dispatch)
-    if isinstance(optimiser, GaussNewton):
-        require_positive(coarse_samples=optimiser.coarse_samples)
-        if optimiser.coarse_steps < 0:
-            raise InputError(f"coarse_steps is {optimiser.coarse_steps}; expected 0 for none or a positive number")
-        return
-    require_positive(batch=optimiser.batch, patience=optimiser.patience, learning_rate=optimiser.learning_rate)
-    for name in ("learning_rate", "weight_decay"):
-        if not 0 <= (value := getattr(optimiser, name)) < math.inf:
-            raise InputError(f"{name} is {value}; expected a finite number, zero or positive")
+    settings = optimiser._asdict()
+    require_positive(**{name: settings[name] for name in POSITIVE if name in settings})
+    for name in ("coarse_steps", "learning_rate", "weight_decay"):
+        if not 0 <= settings.get(name, 0) < math.inf:
+            raise InputError(f"{name} is {settings[name]}; expected a finite number, zero or positive")
+
+
+def suited(parameters: Any, samples: int, residuals: int) -> tuple[str, str]:
+    """Returns the name of the optimiser that suits parameters of these shapes, and a sentence with the reason.
+
+    Gauss-Newton brings P parameters to errors of 1e-8 and below in seconds while its P x P equations are small; the
+    cost of Adam's steps grows only with P.
+    """
+    size = count(parameters)
+    needed = jacobian_bytes(parameters, samples, residuals, chunk_size=CHUNK, keep=False)
+    if size <= MOST_PARAMETERS and needed <= MOST_BYTES:
+        return "gauss-newton", f"{size:,} parameters: the normal equations take {needed / 2**20:,.0f} MiB"
+    limit = f"{MOST_PARAMETERS:,} parameters" if size > MOST_PARAMETERS else f"{MOST_BYTES / 2**30:.0f} GiB"
+    return "adam", f"{size:,} parameters need {needed / 2**20:,.0f} MiB of normal equations; the limit is {limit}"
+
+
+def optimiser_named(name: str, *, precision: str, **settings: Any) -> Optimiser:
+    """Builds an optimiser by name. Settings that it lacks are ignored; a setting of `None` takes its default.
+
+    Raises:
+        InputError: an unknown name, a setting out of range, or Gauss-Newton in a precision other than f64.
+    """
+    if name not in NAMES:
+        raise InputError(f"optimizer is '{name}'; expected one of {', '.join(NAMES)}")
+    kind = NAMES[name]
+    if kind is GaussNewton:
+        require_float64(precision)
+    chosen = kind(**{key: settings[key] for key in kind._fields if settings.get(key) is not None})
+    check(chosen)
+    return chosen
+
+
+def name_of(optimiser: Optimiser) -> str:
+    """The name of an optimiser in command lines."""
+    return next(name for name, kind in NAMES.items() if isinstance(optimiser, kind))
 
 
 def transformation(adam: Adam) -> optax.GradientTransformation:
@@ -104,40 +158,123 @@ def transformation(adam: Adam) -> optax.GradientTransformation:
     return optax.adamw(rate, b2=adam.second_moment_decay, weight_decay=adam.weight_decay)
 
 
-def suited(parameters: Any, samples: int, residuals: int) -> tuple[type[Adam] | type[GaussNewton], str]:
-    """Returns the optimiser that suits parameters of these shapes, and a sentence with the reason.
+class AdamState(NamedTuple):
+    """State of a run; resuming from it is exact. Several seeds add a leading axis."""
 
-    Gauss-Newton brings P parameters to errors of 1e-8 and below in seconds while its P x P equations are small; the
-    cost of Adam's steps grows only with P.
-    """
-    size = count(parameters)
-    needed = jacobian_bytes(parameters, samples, residuals, chunk_size=CHUNK, keep=False)
-    if size <= MOST_PARAMETERS and needed <= MOST_BYTES:
-        return GaussNewton, f"{size:,} parameters: the normal equations take {needed / 2**20:,.0f} MiB"
-    limit = f"{MOST_PARAMETERS:,} parameters" if size > MOST_PARAMETERS else f"{MOST_BYTES / 2**30:.0f} GiB"
-    return Adam, f"{size:,} parameters need {needed / 2**20:,.0f} MiB of normal equations; the limit is {limit}"
+    parameters: Any
+    optimiser: optax.OptState
+    key: Array
+    """[2] raw key data, which can be stored without conversion."""
+    epoch: Array
+    """[] epochs done."""
+    step: Array
+    """[] steps done."""
+    best: Best
+    failed_step: Array
+    """[] steps before the first loss that was not finite, or -1. If it is set, the rest is as before the dispatch."""
 
 
-NAMES: dict[str, type[Optimiser]] = {"adam": Adam, "gauss-newton": GaussNewton}
-
-
-def optimiser_named(name: str, *, precision: str, **settings: Any) -> Optimiser:
-    """Builds an optimiser by name. Settings that it lacks are ignored; a setting of `None` takes its default.
+def stages(problem: Problem, adam: Adam, shared: Sharing) -> list[Stage]:
+    """Returns the single stage of a run.
 
     Raises:
-        InputError: an unknown name, a setting out of range, or Gauss-Newton in a precision other than f64.
+        InputError: the number of devices does not divide a batch.
     """
-    if name not in NAMES:
-        raise InputError(f"optimizer is '{name}'; expected one of {', '.join(NAMES)}")
-    kind = NAMES[name]
-    if kind is GaussNewton:
-        require_float64(precision)
-    chosen = kind(**{key: settings[key] for key in kind._fields if settings.get(key) is not None})
-    check(chosen)
-    return chosen
+    samples = problem.arrays[0].shape[0]
+    batch = min(adam.batch, samples)
+    shares(shared.samples, batch, "samples of a batch")
+    batches = samples // batch  # samples that do not fill a last batch are left out of that epoch
+    epochs = -(-adam.steps // batches)
+    most = min(epochs, -(-adam.steps_per_dispatch // batches))
+    loss, optimiser = loss_of(problem), transformation(adam)
+
+    def begin(parameters: Any, seed: Any) -> AdamState:
+        return AdamState(
+            parameters=parameters,
+            optimiser=optimiser.init(parameters),
+            key=jax.random.key_data(jax.random.key(seed)),
+            epoch=jnp.zeros((), jnp.int32),
+            step=jnp.zeros((), jnp.int32),
+            best=no_best(parameters),
+            failed_step=jnp.asarray(-1, jnp.int32),
+        )
+
+    def batches_of(state: AdamState) -> Any:
+        """Batches of a dispatch, with one permutation per epoch; devices that share them get their own part."""
+
+        def order(epoch: Array) -> Array:
+            key = jax.random.fold_in(jax.random.wrap_key_data(state.key), epoch)
+            return _permutation(key, samples)[: batches * batch].reshape(batches, batch)
+
+        orders = jax.vmap(order)(state.epoch + jnp.arange(most)).reshape(-1, batch)
+        own = share(orders, shared.samples, axis=1)
+        return jax.tree.map(lambda array: array[own], problem.arrays)
+
+    def run(epochs: Array, before: AdamState) -> tuple[AdamState, Array]:
+        """Runs some epochs of one seed and returns [loss, validation, monitor]; devices may share every batch."""
+        drawn, dtype = batches_of(before), before.best.validation.dtype
+
+        def step(index: Array, carry: tuple[AdamState, Array]) -> tuple[AdamState, Array]:
+            state, total = carry
+            some = jax.tree.map(lambda array: array[index], drawn)
+            value, gradient = mean(jax.value_and_grad(loss)(state.parameters, some), shared.samples)
+            updates, optimiser_state = optimiser.update(gradient, state.optimiser, state.parameters)
+            state = state._replace(
+                parameters=optax.apply_updates(state.parameters, updates),
+                optimiser=optimiser_state,
+                step=state.step + 1,
+                # Number of the first loss that is not finite; the steps after it are discarded with the dispatch.
+                failed_step=jnp.where(jnp.isfinite(value) | (state.failed_step >= 0), state.failed_step, state.step),
+            )
+            return state, total + value
+
+        # One flat loop with a traced length, because the last dispatch of a run may be shorter.
+        steps = epochs * batches
+        state, total = jax.lax.fori_loop(0, steps, step, (before, jnp.zeros((), dtype)))
+        state = state._replace(epoch=before.epoch + epochs)
+        finite = jnp.isfinite(optax.tree.norm(state.parameters))
+        failed_step = jnp.where(finite | (state.failed_step >= 0), state.failed_step, state.step)
+        # One copy per dispatch keeps the last good state; a test in every step would slow down the loop.
+        state = jax.tree.map(lambda new, old: jnp.where(failed_step < 0, new, old), state, before)
+        # Devices of different models may round differently: all continue from the state of the first.
+        state = first(state, shared.samples)
+        value, shown = first(problem.score(state.parameters), shared.samples)
+        best = better_of(state.best, state.parameters, value, state.step)
+        values = jnp.stack([jnp.asarray(v, dtype) for v in (total / steps, value, shown)])
+        return state._replace(failed_step=failed_step, best=best), values
+
+    starts, runs = (jax.vmap(begin), jax.vmap(run, (None, 0))) if problem.several else (begin, run)
+    dispatch = jax.jit(by_devices(runs, shared), donate_argnums=1)
+
+    def left(state: AdamState) -> int:
+        return epochs - int(np.max(state.epoch))
+
+    def compile_(state: AdamState) -> Dispatch:
+        compiled = dispatch.lower(most, state).compile()
+        return lambda state: compiled(min(most, left(state)), state)
+
+    def ended(state: AdamState) -> Stop | None:
+        if np.all(np.asarray(state.failed_step) >= 0):
+            return Stop("not finite", int(np.max(state.failed_step)))
+        if left(state) <= 0:
+            return Stop("finished", int(np.max(state.step)))
+        if np.all(np.asarray(state.step - state.best.step) >= adam.patience):
+            return Stop("no improvement", int(np.max(state.step)))
+        return None
+
+    return [Stage("", lambda before: jax.jit(starts)(problem.parameters, problem.seed), compile_, ended)]
 
 
-def name_of(optimiser: Optimiser | type[Optimiser]) -> str:
-    """The name of an optimiser in command lines."""
-    kind = optimiser if isinstance(optimiser, type) else type(optimiser)
-    return next(name for name, optimiser_kind in NAMES.items() if optimiser_kind is kind)
+def _permutation(key: Array, count: int) -> Array:
+    """Returns a random order of 0..count-1.
+
+    Up to 2^16 it sorts single words twice, with random bits above the index: four times as fast as
+    `jax.random.permutation`. Ties in one sort keep the order of the other; at 2^16, about 0.5 pairs tie in both.
+    """
+    place_bits = max(1, (count - 1).bit_length())
+    if place_bits > 16:
+        return jax.random.permutation(key, count)
+    words = jax.random.bits(key, (2, count), jnp.uint32) << place_bits
+    ordered = jnp.sort(words | jnp.arange(count, dtype=jnp.uint32))
+    first, second = (ordered & (2**place_bits - 1)).astype(jnp.int32)
+    return first[second]

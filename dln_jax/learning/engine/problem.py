@@ -160,8 +160,7 @@ class Training(NamedTuple):
     @property
     def validation(self) -> Any:
         """Lowest validation score, inf before the first: a number, or an array [seeds]."""
-        values = [at.validation for at in self.history]
-        return plain(np.nanmin([np.full_like(values[0], np.inf, float), *values], axis=0)) if values else math.inf
+        return plain(np.fmin.reduce([at.validation for at in self.history], initial=math.inf))
 
 
 ProgressReport = Callable[[Progress], None]

@@ -9,12 +9,15 @@ noise of the torques, or rounding, and when time is up. A residual network is tr
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
+from dln_jax.data.arrays import spread
 from dln_jax.data.encoders.sampling import noise_of
 from dln_jax.data.log import Log
 from dln_jax.data.parts import Parts
@@ -22,17 +25,16 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import every
 from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.files import is_file, read_json, write_json
+from dln_jax.identification import residual
 from dln_jax.identification.identify import identify, parameters_of
-from dln_jax.identification.residual import fit_residual, inner_split
 from dln_jax.identification.rigid_tree import build_rigid_tree, describe_rigid_tree
-from dln_jax.learning.context import Context
+from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.learning.fit import Fit, direct_fit
+from dln_jax.learning.fits.direct import needs_of_tree, with_joint_laws
 from dln_jax.learning.fits.settings import Automatic, Kernel, LearnedTree, Network, Trigonometric
-from dln_jax.learning.fits.tree import needs_of_tree, with_joint_laws
 from dln_jax.learning.linear import MOST_PARAMETERS, parameters_of_degree
-from dln_jax.learning.objectives import SCALED_TORQUE, require_scales, squared_torque_errors, torque_scale
-from dln_jax.learning.select import Trial, lowest, mean_of_segments, select, simplest
-from dln_jax.learning.selection import say_selection
+from dln_jax.learning.objectives import squared_torque_errors, torque_scale
+from dln_jax.learning.select import Trial, lowest, mean_of_segments, say_selection, select, simplest
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import USUAL
 from dln_jax.mechanics.trees.description import tree_to_json
@@ -66,26 +68,25 @@ def fit(settings: Automatic, log: Log, parts: Parts, context: Context) -> Fit:
         InputError: no model could be fitted.
     """
     train, validation, _ = parts.sets
-    require_scales(train)
+    for key in ("q", "qd", "qdd"):
+        spread(key, getattr(train, key))  # refuses numbers that are far too large
+    torque_scale(train)
     log = log._replace(needs=with_joint_laws(log.needs))
-    noise = noise_of(train.tau, train.trajectory)
     limited = math.isfinite(context.until)
-    context = context if limited else context.within(SELECTION_SECONDS)
-
-    def bound(name: str, candidate: Candidate) -> Callable[[], Fit | str]:
-        return lambda: fit_or_load(name, candidate, parts, context if limited else context.within(CANDIDATE_SECONDS))
+    context = context.within(math.inf if limited else SELECTION_SECONDS)
+    attempt = partial(fit_or_load, log, parts, context, math.inf if limited else CANDIDATE_SECONDS)
 
     def beside(base: Fit) -> tuple[str, Callable[[], Fit | str]] | None:
         if not (base.properties.linear or base.properties.searched):
             return None
         name = base.name + BESIDE
-        return name, bound(name, lambda own: with_network(base, log, parts, own))
+        return name, partial(attempt, name, partial(with_network, base))
 
     chosen, rows, ended = compare(
-        {name: bound(name, candidate) for name, candidate in candidates_of(settings, log, parts).items()},
+        {name: partial(attempt, name, candidate) for name, candidate in candidates_of(settings, log)},
         train,
         validation,
-        noise=noise if np.isfinite(noise).all() and noise.all() else None,
+        noise=noise_of(train.tau, train.trajectory),
         until=context.until,
         definite=lambda result: is_definite(result, parts),
         beside=beside,
@@ -100,11 +101,11 @@ def compare(
     train: Trajectories,
     validation: Trajectories,
     *,
-    noise: Float[np.ndarray, " d"] | None = None,
-    until: float = math.inf,
-    definite: Callable[[Any], bool] = lambda result: True,
-    beside: Callable[[Any], tuple[str, Callable[[], Any]] | None] = lambda result: None,
-    say: Callable[[str], None] = lambda line: None,
+    noise: Float[np.ndarray, " d"] | float,
+    until: float,
+    definite: Callable[[Any], bool],
+    beside: Callable[[Any], tuple[str, Callable[[], Any]] | None],
+    say: Callable[[str], None],
 ) -> tuple[Trial, list[dict[str, Any]], str]:
     """Fits candidates in order; chooses the first that no other betters significantly, definite ones before others.
 
@@ -115,7 +116,7 @@ def compare(
             structured first.
         train: samples that they are fitted to; the variances of their torques are the units of the errors.
         validation: other motions.
-        noise: standard deviation of the joints' torque noise, N m or N, if known; the comparison ends at such errors.
+        noise: standard deviation of the joints' torque noise, N m or N, or NaN; the comparison ends at such errors.
         until: reading of `time.perf_counter` after which no further candidate is tried, once one is fitted.
         definite: whether a model's mass matrix is positive definite; true for models without one.
         beside: chosen model -> one more candidate made of it, tried unless the comparison has ended.
@@ -125,12 +126,11 @@ def compare(
         InputError: torques that do not vary, or no candidate that could be fitted.
     """
     scale, rows, ended = np.asarray(torque_scale(train)), {}, ""
-    share = None if noise is None else (noise / scale) ** 2
-    every_candidate = dict(candidates)
+    share = (noise / scale) ** 2
 
-    def attempt(name: str) -> tuple[Any, np.ndarray | None]:
+    def attempt(name: str, candidate: Callable[[], Any]) -> tuple[Any, np.ndarray | None]:
         began = time.perf_counter()
-        result = every_candidate[name]()
+        result = candidate()
         seconds, errors = time.perf_counter() - began, None
         if not isinstance(result, str):
             squares = squared_torque_errors(result.model, result.parameters, validation, scale)
@@ -159,7 +159,7 @@ def compare(
             return False
         if (nmse <= EXACT).all():
             ended = f"{trial.candidate} is exact"
-        elif share is not None and np.all((nmse >= LEAST_NOISE * share) & (nmse <= MOST_NOISE * share)):
+        elif np.all((nmse >= LEAST_NOISE * share) & (nmse <= MOST_NOISE * share)):
             ended = f"the errors of {trial.candidate} are the noise of the torques"
         return bool(ended)
 
@@ -168,64 +168,59 @@ def compare(
         sound = [trial for trial in trials if rows[trial.candidate]["definite"] and trial.validation <= affordable]
         return simplest(sound or trials)
 
-    chosen, trials = select(list(candidates), attempt, rule=rule, until=until, stop=stop)
+    chosen, trials = select(
+        list(candidates), lambda name: attempt(name, candidates[name]), rule=rule, until=until, stop=stop
+    )
     left = list(candidates)[len(trials) :]
     if left and not ended:
         ended = f"time is out; not tried: {', '.join(left)}"
     if not ended and (more := beside(chosen.outcome)) is not None:
-        every_candidate.update([more])
-        trial = Trial(more[0], *attempt(more[0]))
+        trial = Trial(more[0], *attempt(*more))
         chosen = rule([chosen, trial]) if trial.errors is not None else chosen
     return chosen, list(rows.values()), ended
 
 
-Candidate = Callable[[Context], Fit | str]
-"""Context -> the fit, or the reason why there is none; an `InputError` counts as a reason."""
+Candidate = Callable[[Log, Parts, Context], Fit | str]
+"""The fit, or the reason why there is none; an `InputError` counts as a reason."""
 
 
-def candidates_of(settings: Automatic, log: Log, parts: Parts) -> dict[str, Candidate]:
-    """The candidates by name, from the strongest prior knowledge to the weakest."""
-    known: dict[str, Candidate] = {}
-    if log.robot is not None:
-        known["rigid-tree"] = lambda context: identify_robot(log, parts)
-    arm = LearnedTree(parents=settings.parents, kinematic_prior=settings.kinematic_prior)
-    learned: dict[str, Candidate] = {"learned-tree": lambda context: arm.fit(log, parts, context)}
+def candidates_of(settings: Automatic, log: Log) -> list[tuple[str, Candidate]]:
+    """The candidates with their names, from the strongest prior knowledge to the weakest."""
     first, second = (parameters_of_degree(log.needs, degree) for degree in (1, 2))
+    size = "too many" if first is None else f"{first:,}"
+    too_large = f"its basis has {size} coefficients; at most {MOST_PARAMETERS:,} are tried"
+    fits = first is not None and first <= MOST_PARAMETERS
+    explicit = "trigonometric", Trigonometric().fit if fits else lambda *_: too_large
+    learned = "learned-tree", LearnedTree(parents=settings.parents, kinematic_prior=settings.kinematic_prior).fit
     # A small basis is fitted within a second; a search for joint frames takes half a minute.
     small = second is not None and second <= MOST_PARAMETERS
-    size = "too many" if first is None else f"{first:,}"
-    explicit: dict[str, Candidate] = {
-        "trigonometric": lambda context: (
-            Trigonometric().fit(log, parts, context)
-            if first is not None and first <= MOST_PARAMETERS
-            else f"its basis has {size} coefficients; at most {MOST_PARAMETERS:,} are tried"
-        )
-    }
-    kernel: dict[str, Candidate] = {"trigonometric-kernel": lambda context: Kernel().fit(log, parts, context)}
-    network: dict[str, Candidate] = {NETWORK: lambda context: Network().fit(log, parts, context)}
-    return known | (explicit | learned if small else learned | explicit | kernel) | network
+    return [
+        *[("rigid-tree", lambda log, parts, context: identify_robot(log, parts))] * (log.robot is not None),
+        *([explicit, learned] if small else [learned, explicit, ("trigonometric-kernel", Kernel().fit)]),
+        (NETWORK, Network().fit),
+    ]
 
 
-def fit_or_load(name: str, candidate: Candidate, parts: Parts, context: Context) -> Fit | str:
+def fit_or_load(log: Log, parts: Parts, context: Context, seconds: float, name: str, candidate: Candidate) -> Fit | str:
     """Fits a candidate and stores it in a folder of its own, or takes it from there if the run is resumed.
 
     A learned tree is fitted again: its verdict needs the search.
     """
-    place = None if context.folder is None else context.folder / "candidates" / name
-    done = None if place is None else place / "candidate.json"
-    if place is not None and done is not None and context.resume and is_file(done):
+    place = (context.folder or Path()) / "candidates" / name
+    done = place / "candidate.json"
+    if context.folder is not None and context.resume and is_file(done):
         facts = read_json(done, remedy=f"remove {place}")
         if facts.get("reason"):
             return str(facts["reason"])
         run = load(place)
         needs = needs_from_json(run.description["needs"])
-        return direct(run.description, needs, parts, run.parameters, float(facts["seconds"]))
+        return direct_fit(run.description, needs, parts, run.parameters, seconds=float(facts["seconds"]))
     began = time.perf_counter()
     try:
-        result = candidate(context)
+        result = candidate(log, parts, context.within(seconds))
     except InputError as error:
         result = str(error)
-    if place is None or done is None:
+    if context.folder is None:
         return result
     place.mkdir(parents=True, exist_ok=True)
     if isinstance(result, str):
@@ -235,11 +230,6 @@ def fit_or_load(name: str, candidate: Candidate, parts: Parts, context: Context)
         if result.search is None:
             write_json(done, {"seconds": time.perf_counter() - began})
     return result
-
-
-def direct(description: dict[str, Any], needs: Needs, parts: Parts, parameters: Any, seconds: float) -> Fit:
-    """A direct fit of torques whose loss is unknown."""
-    return direct_fit(description, needs, parts, parameters, SCALED_TORQUE, loss=math.nan, seconds=seconds)
 
 
 def is_definite(result: Fit, parts: Parts) -> bool:
@@ -263,7 +253,7 @@ def identify_robot(log: Log, parts: Parts) -> Fit:
     model, known = build_rigid_tree(description, log.robot)
     solution = identify(model, known, train, joints=needs.joints)
     parameters = parameters_of(solution.theta, known)
-    return direct(description, needs, parts, parameters, time.perf_counter() - began)
+    return direct_fit(description, needs, parts, parameters, seconds=time.perf_counter() - began)
 
 
 def with_network(base: Fit, log: Log, parts: Parts, context: Context) -> Fit | str:
@@ -274,8 +264,8 @@ def with_network(base: Fit, log: Log, parts: Parts, context: Context) -> Fit | s
     """
     began, train = time.perf_counter(), parts.sets.train
     base = rigid_tree_of(base, log, parts) if base.properties.searched else base
-    fitted, chosen_by = inner_split(train)
-    added = fit_residual(
+    fitted, chosen_by = residual.inner_split(train)
+    added = residual.fit_residual(
         base.model,
         base.parameters,
         log.needs,
@@ -287,7 +277,7 @@ def with_network(base: Fit, log: Log, parts: Parts, context: Context) -> Fit | s
         return "a residual network does not lower the validation error"
     keywords = {key: value for key, value in base.description.items() if key not in ("name", "precision")}
     description = describe(f"{base.name}{BESIDE}", precision="f64", **keywords, **added.settings)
-    return direct(description, base.needs, parts, added.parameters, time.perf_counter() - began)
+    return direct_fit(description, base.needs, parts, added.parameters, seconds=time.perf_counter() - began)
 
 
 def rigid_tree_of(learned: Fit, log: Log, parts: Parts) -> Fit:
@@ -301,4 +291,4 @@ def rigid_tree_of(learned: Fit, log: Log, parts: Parts) -> Fit:
     parameters = RigidTreeParameters(
         solution.inertias, solution.armature, solution.viscous, solution.coulomb, solution.offset
     )
-    return direct(description, of_rigid, parts, parameters, 0.0)
+    return direct_fit(description, of_rigid, parts, parameters)

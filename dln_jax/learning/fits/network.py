@@ -1,8 +1,8 @@
 """Networks, trained by an optimiser under a checkpoint: one seed, several in one program, or networks that grow."""
 
 import itertools
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,24 +12,22 @@ from dln_jax.data.parts import Parts
 from dln_jax.data.splits import Split, drawn, merged
 from dln_jax.data.splits import select as trajectories
 from dln_jax.learning import dynamics
-from dln_jax.learning.context import Context
-from dln_jax.learning.dynamics import MANY_JOINTS, suited_network
+from dln_jax.learning.dynamics import MANY_JOINTS, suited_network, summed_with_friction, without_offset
+from dln_jax.learning.engine.checkpoint import CHECKPOINT, Context, no_progress
 from dln_jax.learning.engine.fit import fit as train
-from dln_jax.learning.engine.optimisers import Optimiser, name_of, optimiser_named
-from dln_jax.learning.engine.problem import Problem, Training, losses
-from dln_jax.learning.fit import Fit, fit_of
+from dln_jax.learning.engine.optimisers import optimiser_named
+from dln_jax.learning.engine.problem import Training, losses
+from dln_jax.learning.fit import Fit
 from dln_jax.learning.fits.settings import OF_ADAM, Network
-from dln_jax.learning.gauges import summed_with_friction, without_offset
 from dln_jax.learning.latency import latency_of
-from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, Objective, objective_of
-from dln_jax.learning.select import Trial, lowest, select
-from dln_jax.learning.selection import say_selection
+from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, objective_of
+from dln_jax.learning.select import say_selection
 from dln_jax.process import SOON
 from dln_jax.scale import device_lines, of_first_process
 from dln_jax.sizes import require_network
-from dln_jax.types import InputError, Needs, require_positive, require_seed
+from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.catalogue import CATALOGUE
-from dln_jax.zoo.descriptions import Description, build, describe_for
+from dln_jax.zoo.descriptions import build, describe_for
 
 STRUCTURED = "structured-delan"
 WITHOUT_STRUCTURE = 400
@@ -38,95 +36,87 @@ WIDTHS, DEPTHS = (4, 8, 16, 32), (1, 2)
 """Sizes of networks that grow."""
 
 
-class Plan(NamedTuple):
-    """A network, its optimiser and its samples."""
-
-    description: Description
-    needs: Needs
-    objective: Objective
-    optimiser: Optimiser
-    reason: str
-    """Reason for this optimiser; empty if the user chose it."""
-    samples: int | None
-    """Number of training samples that are drawn; `None` for all."""
-    seeds: int | tuple[int, ...]
-
-
 def fit(settings: Network, log: Log, parts: Parts, context: Context) -> Fit:
     """Trains the network; cross-validation selects one of several seeds, and a target grows networks.
 
     Raises:
         InputError: settings out of range, data that cannot determine the model, or a loss that is not finite.
     """
-    plan = plan_network(settings, log, parts, context.seed)
-    say = context.say
-    if plan.needs != log.needs:
-        say("friction has no offset: the potential takes any constant")
-    if CATALOGUE[settings.model].properties.canonical and plan.objective.of_torques:
-        say("no momenta p in the data: the Hamiltonian is fitted to torques")
-    why = f" ({plan.reason})" if plan.reason else ""
-    say(f"{settings.model}, {plan.description['precision']}, {name_of(plan.optimiser)}{why}")
-    for line in device_lines(plan.description["precision"]):
-        say(line)
+    plan = plan_network(settings, log, parts, context)
+    quiet = context._replace(progress=no_progress)
     if settings.target is not None:
-        return grow(settings.target, plan, parts, context)
+        return grow(settings.target, plan, parts, quiet)
     several = settings.seeds > 1 and settings.folds > 1
     seconds = context.seconds / (settings.folds + 1 if several else 1)
-    training = train_plan(plan, parts.sets, context.within(seconds), shown=True)
-    if training.stop.reason != "not finite" and not np.isfinite(training.validation).any():
+    training = train_plan(plan, parts.sets, context.within(seconds))
+    finite = np.isfinite(np.ravel(training.validation))
+    if training.stop.reason != "not finite" and not finite.any():
         raise InputError("no validation error is finite; there is no model: look for large numbers in the data")
-    best = int(np.argmin(np.nan_to_num(np.ravel(training.validation), nan=np.inf)))
+    best = int(np.argmin(np.where(finite, training.validation, np.inf)))
     if several:
-        best = cross_validate(plan, parts.sets, context, settings.folds)
-        if not np.isfinite(training.validation[best]):
-            best = int(np.argmin(np.nan_to_num(training.validation, nan=np.inf)))
-    return fit_of_plan(plan, training, best, cross_validated=several)
+        chosen = cross_validate(plan, parts.sets, quiet, settings.folds)
+        best = chosen if finite[chosen] else best
+    return of_training(plan, training, best, cross_validated=several)
 
 
-def fit_of_plan(plan: Plan, training: Training, best: int, **how: Any) -> Fit:
-    """The fit of a trained plan."""
-    how |= {"objective": plan.objective, "optimiser": plan.optimiser, "seeds": plan.seeds}
-    return fit_of(plan.description, plan.needs, training, best, **how)
+def of_training(plan: Fit, training: Training, best: int = 0, *, cross_validated: bool = False) -> Fit:
+    """The plan with the parameters of a training."""
+    trained = replace(plan, training=training, best=best, cross_validated=cross_validated)
+    return replace(trained, parameters=trained.of_seed(best))
 
 
-def plan_network(settings: Network, log: Log, parts: Parts, seed: int) -> Plan:
-    """Plans the network and its optimiser: as stated, or as the sizes of model and data suggest."""
-    require_consistent(settings, seed)
-    name, sets, needs, optimizer = settings.model, parts.sets, log.needs, settings.optimizer
+def plan_network(settings: Network, log: Log, parts: Parts, context: Context) -> Fit:
+    """Plans the network and its optimiser, as stated or as the sizes of model and data suggest: a fit not yet trained.
+
+    Says what it chose.
+    """
+    require_consistent(settings, context.seed)
+    name, optimizer, reason = settings.model, settings.optimizer, ""
+    sets, needs = parts.sets, log.needs
     if summed_with_friction(needs, sets.train, network=True):
         needs = without_offset(needs)
-    objective = objective_of(name, sets.train, settings.objective)
-    if objective is TORQUE and settings.target is None:
-        objective = SCALED_TORQUE
-    definite = CATALOGUE[name].properties.definite
+    torque = SCALED_TORQUE if settings.target is None else TORQUE
+    objective = objective_of(name, sets.train, settings.objective, torque=torque)
+    properties = CATALOGUE[name].properties
     sized = settings.width is not None or settings.depth is not None or settings.target is not None
     suited = None
     if name == STRUCTURED and optimizer == "auto" and not sized and needs.degrees_of_freedom >= MANY_JOINTS:
         suited = suited_network(needs, sets.train)
-        optimizer = suited.optimizer
+        optimizer, reason = suited.optimizer, suited.reason
     adam = optimizer == "adam"
     # A structured model needs fewer units; first-order training needs more.
-    size: dict[str, Any] = {"width": 64 if adam else 8 if definite else 16, "depth": 2, "activation": "tanh"}
+    size: dict[str, Any] = {"width": 64 if adam else 8 if properties.definite else 16, "depth": 2, "activation": "tanh"}
     size |= {key: value for key in size if (value := getattr(settings, key)) is not None}
-    size |= {} if suited is None else suited.keywords
+    size |= suited.keywords if suited else {}
     require_network(width=size["width"], depth=size["depth"])
     precision = settings.precision or ("f32" if adam else "f64")
     description = describe_for(name, sets.train, needs, precision=precision, **size)
-    reason = "" if suited is None else suited.reason
     if optimizer == "auto":
-        kind, reason = dynamics.suited_optimiser(build(description), sets, objective)
-        optimizer = name_of(kind)
+        optimizer, reason = dynamics.suited_optimiser(build(description), sets, objective)
         description["precision"] = precision = settings.precision or ("f32" if optimizer == "adam" else "f64")
-    steps, samples = settings.steps, settings.samples
-    if suited is not None:
-        steps = suited.steps if steps is None else steps
-        samples = suited.samples if samples is None else samples
-    elif optimizer == "gauss-newton" and not definite:
-        steps = steps or WITHOUT_STRUCTURE
-    chosen = {key: getattr(settings, key) for key in (*OF_ADAM, "target")}
-    optimiser = optimiser_named(optimizer, precision=precision, steps=steps, **chosen)
-    seeds = seed if settings.seeds == 1 else tuple(range(seed, seed + settings.seeds))
-    return Plan(description, needs, objective, optimiser, reason, samples, seeds)
+    chosen = {key: getattr(settings, key) for key in (*OF_ADAM, "target", "steps")}
+    if settings.steps is None and suited:
+        chosen["steps"] = suited.steps
+    elif settings.steps is None and not properties.definite and optimizer == "gauss-newton":
+        chosen["steps"] = WITHOUT_STRUCTURE
+    optimiser = optimiser_named(optimizer, precision=precision, **chosen)
+    if needs != log.needs:
+        context.say("friction has no offset: the potential takes any constant")
+    if properties.canonical and objective.of_torques:
+        context.say("no momenta p in the data: the Hamiltonian is fitted to torques")
+    context.say(f"{name}, {precision}, {optimizer}{f' ({reason})' if reason else ''}")
+    for line in device_lines(precision):
+        context.say(line)
+    return Fit(
+        build(description),
+        None,
+        description,
+        needs=needs,
+        objective=objective,
+        optimiser=optimiser,
+        samples=suited.samples if suited and settings.samples is None else settings.samples,
+        seeds=context.seed if settings.seeds == 1 else tuple(range(context.seed, context.seed + settings.seeds)),
+    )
 
 
 def require_consistent(settings: Network, seed: int) -> None:
@@ -149,32 +139,26 @@ def require_consistent(settings: Network, seed: int) -> None:
             raise InputError(f"--{name} is for one network, and --target grows several; leave it out")
 
 
-def problem_of(plan: Plan, sets: Split) -> Problem:
-    """The fitting problem of a network; drawn samples are scaled by the spread of all of them."""
-    scale, some = plan.objective.scale(sets.train), sets
+def train_plan(plan: Fit, sets: Split, context: Context, *, name: str = CHECKPOINT) -> Training:
+    """Trains the plan on these sets in the time of the context; drawn samples are scaled by the spread of all."""
+    assert plan.optimiser is not None, "a network is trained by an optimiser"
+    scale, total = plan.objective.scale(sets.train), plan.optimiser.steps
+    arrays = (getattr(data, key) for data in sets for key in plan.objective.keys)
+    checkpoint = context.checkpoint(name, plan.optimiser, arrays, seeds=plan.seeds)
     if plan.samples is not None:
-        some = sets._replace(train=drawn(sets.train, plan.samples, int(np.ravel(plan.seeds)[0])))
-    return dynamics.problem(
-        build(plan.description), some, plan.objective._replace(scale=lambda data: scale), seeds=plan.seeds
-    )
-
-
-def train_plan(plan: Plan, sets: Split, context: Context, *, name: str = "checkpoint", shown: bool = False) -> Training:
-    """Trains the plan on these sets in the time of the context."""
-    total = plan.optimiser.steps
-    identity = dynamics.identity_of(plan.optimiser, sets, plan.objective, seeds=plan.seeds)
-    with context.progress(total) if shown else Context().progress(total) as show:
+        sets = sets._replace(train=drawn(sets.train, plan.samples, int(np.ravel(plan.seeds)[0])))
+    with context.progress(total) as show:
         return train(
-            problem_of(plan, sets),
+            dynamics.problem(plan.model, sets, plan.objective._replace(scale=lambda data: scale), seeds=plan.seeds),
             plan.optimiser,
-            checkpoint=context.checkpoint(identity, name),
+            checkpoint=checkpoint,
             report=lambda at: show(min(int(np.max(at.step)), total), losses(at)),
             seconds=context.seconds,
             mesh=context.mesh,
         )
 
 
-def cross_validate(plan: Plan, sets: Split, context: Context, folds: int) -> int:
+def cross_validate(plan: Fit, sets: Split, context: Context, folds: int) -> int:
     """Index of the seed with the lowest cross-validation error over folds of the motions.
 
     One or two validation motions often prefer the worse of two seeds. Every motion outside the test is in one fold.
@@ -194,60 +178,43 @@ def cross_validate(plan: Plan, sets: Split, context: Context, folds: int) -> int
     return int(np.argmin(np.nan_to_num(errors, nan=np.inf)))
 
 
-def grow(target: float, plan: Plan, parts: Parts, context: Context) -> Fit:
+def grow(target: float, plan: Fit, parts: Parts, context: Context) -> Fit:
     """Trains all networks of a width before the next width, up to the first width that meets the target.
 
     Keeps the fastest network that meets it or, if none does, the most accurate.
     """
-    speeds: dict[str, float] = {}
-    met: list[Trial] = []
+    fits: list[Fit] = []
     rows: list[dict[str, Any]] = []
-    kinds = list(itertools.product(DEPTHS, (True, False) if plan.needs.gravity else (False,)))
-
+    met: list[int] = []
     ended = ""
-
-    def sizes() -> Iterator[dict[str, Any]]:
-        nonlocal ended
-        for width in WIDTHS:
-            for depth, shared in kinds:
-                # All processes have to agree.
-                if rows and of_first_process(context.seconds <= SOON, context.mesh):
-                    ended = f"out of time: networks of width {width} and more were not all tried"
-                    return
-                yield {"width": width, "depth": depth, "shared_trunk": shared}
-            if met:
-                return
-
-    def attempt(size: dict[str, Any]) -> tuple[Fit, np.ndarray]:
-        networks = 1 if size["shared_trunk"] else 2
-        own = plan._replace(description={**plan.description, **size})
-        name = f"checkpoint_{size['width']}x{size['depth']}_{networks}"
-        result = fit_of_plan(own, train_plan(own, parts.sets, context, name=name), 0)
-        error = float(result.training.validation)
-        # The selection depends on the time, so all processes must use the same value.
-        speed = of_first_process(latency_of(result, parts.sets.test, calls=2000).p50_us, context.mesh)
-        words = f"{size['depth']} x {size['width']}, {'one network' if networks == 1 else 'two networks'}"
-        context.say(f"{words}: validation {error:.2e}, target {'met' if error <= target else 'not met'}")
+    for width, depth, shared in itertools.product(WIDTHS, DEPTHS, (True, False) if plan.needs.gravity else (False,)):
+        if met and width > fits[-1].description["width"]:
+            break
+        # All processes have to agree.
+        if fits and of_first_process(context.seconds <= SOON, context.mesh):
+            ended = f"out of time: networks of width {width} and more were not all tried"
+            break
+        description = {**plan.description, "width": width, "depth": depth, "shared_trunk": shared}
+        own = replace(plan, description=description, model=build(description))
+        training = train_plan(own, parts.sets, context, name=f"checkpoint_{width}x{depth}_{1 if shared else 2}")
+        result, error = of_training(own, training), float(training.validation)
+        name = f"{depth} x {width}, {'one network' if shared else 'two networks'}"
+        context.say(f"{name}: validation {error:.2e}, target {'met' if error <= target else 'not met'}")
         rows.append(
             {
-                "name": words,
+                "name": name,
                 "parameters": sum(np.size(leaf) for leaf in jax.tree.leaves(result.parameters)),
                 "validation_error": error,
-                "train_seconds": result.training.train_seconds + result.training.compile_seconds,
-                "one_step_us": speed,
+                "train_seconds": training.train_seconds + training.compile_seconds,
+                # The selection depends on the time, so all processes must use the same value.
+                "one_step_us": of_first_process(latency_of(result, parts.sets.test, calls=2000).p50_us, context.mesh),
             }
         )
-        speeds[words] = speed
-        trial = Trial(size, (result, words), np.array([error]))
-        met.extend([trial] * (error <= target))
-        return trial.outcome, trial.errors  # type: ignore[return-value]
-
-    chosen, _ = select(
-        sizes(),
-        attempt,
-        rule=lambda trials: min(met, key=lambda trial: speeds[trial.outcome[1]]) if met else lowest(trials),
-    )
-    say_selection(context, f"grown until the validation error is {target:g}", chosen.outcome[1], ended, rows)
+        met += [len(fits)] * (error <= target)
+        fits.append(result)
+    key = "one_step_us" if met else "validation_error"
+    kept = min(met or range(len(fits)), key=lambda place: rows[place][key])
+    say_selection(context, f"grown until the validation error is {target:g}", rows[kept]["name"], ended, rows)
     if not met:
         context.say(f"no candidate meets {target:g}; kept is the most accurate. More --steps or --seconds may help")
-    return chosen.outcome[0]
+    return fits[kept]

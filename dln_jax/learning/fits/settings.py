@@ -6,16 +6,17 @@ They are options of the commands as well. Importing this module does not import 
 """
 
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from dln_jax.options import InPython, Unstated
 
 if TYPE_CHECKING:
     import dln_jax.data.log
     import dln_jax.data.parts
-    import dln_jax.learning.context
-    from dln_jax.learning.fit import Fit
+    import dln_jax.learning.engine.checkpoint
+    import dln_jax.learning.fit
 
 ActivationName = Literal["tanh", "softplus", "silu", "gelu", "sin", "cos"]
 Precision = Literal["f32", "f64"]
@@ -24,7 +25,25 @@ OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience", "rule")
 
 
 @dataclass(frozen=True)
-class Goal:
+class Way:
+    """Settings of a way of fitting."""
+
+    FITTED_BY: ClassVar[str]
+    """Module and function of `learning.fits`, imported when it is called."""
+
+    def fit(
+        self,
+        log: "dln_jax.data.log.Log",
+        parts: "dln_jax.data.parts.Parts",
+        context: "dln_jax.learning.engine.checkpoint.Context",
+    ) -> "dln_jax.learning.fit.Fit":
+        """Fits a model to the training motions of a log."""
+        module, function = self.FITTED_BY.split(".")
+        return getattr(import_module(f"dln_jax.learning.fits.{module}"), function)(self, log, parts, context)
+
+
+@dataclass(frozen=True)
+class Goal(Way):
     """Precision and objective of a fit."""
 
     precision: Unstated[Precision] = None
@@ -69,16 +88,7 @@ class Network(Goal):
     folds: InPython[int] = 3
     """Folds of the cross-validation over seeds (1: use the validation motions alone)."""
 
-    def fit(
-        self,
-        log: "dln_jax.data.log.Log",
-        parts: "dln_jax.data.parts.Parts",
-        context: "dln_jax.learning.context.Context",
-    ) -> "Fit":
-        """Trains the network."""
-        from dln_jax.learning.fits.network import fit
-
-        return fit(self, log, parts, context)
+    FITTED_BY = "network.fit"
 
 
 @dataclass(frozen=True)
@@ -89,20 +99,11 @@ class Trigonometric(Goal):
     degree: Unstated[int] = None
     """Degree of the polynomials in every joint (default: chosen for each joint by validation)."""
 
-    def fit(
-        self,
-        log: "dln_jax.data.log.Log",
-        parts: "dln_jax.data.parts.Parts",
-        context: "dln_jax.learning.context.Context",
-    ) -> "Fit":
-        """Fits the basis by least squares."""
-        from dln_jax.learning.fits.direct import fit_basis
-
-        return fit_basis(self, log, parts, context)
+    FITTED_BY = "direct.fit_basis"
 
 
 @dataclass(frozen=True)
-class Kernel:
+class Kernel(Way):
     """The trigonometric energies in kernel form."""
 
     model: str = "trigonometric-kernel"
@@ -111,20 +112,11 @@ class Kernel:
     precision: Unstated[Precision] = None
     """Floating-point type of the model (default: f64)."""
 
-    def fit(
-        self,
-        log: "dln_jax.data.log.Log",
-        parts: "dln_jax.data.parts.Parts",
-        context: "dln_jax.learning.context.Context",
-    ) -> "Fit":
-        """Fits a Gaussian process of the energies."""
-        from dln_jax.learning.fits.direct import fit_energies
-
-        return fit_energies(self, log, parts, context)
+    FITTED_BY = "direct.fit_energies"
 
 
 @dataclass(frozen=True)
-class Arm:
+class Arm(Way):
     """Prior knowledge of an arm whose joint frames are searched."""
 
     parents: Unstated[str] = None
@@ -140,16 +132,7 @@ class LearnedTree(Arm, Goal):
 
     model: str = "learned-tree"
 
-    def fit(
-        self,
-        log: "dln_jax.data.log.Log",
-        parts: "dln_jax.data.parts.Parts",
-        context: "dln_jax.learning.context.Context",
-    ) -> "Fit":
-        """Searches the frames, and eliminates everything else."""
-        from dln_jax.learning.fits.tree import fit
-
-        return fit(self, log, parts, context)
+    FITTED_BY = "direct.fit_arm"
 
 
 @dataclass(frozen=True)
@@ -158,19 +141,9 @@ class Automatic(Arm):
 
     model: str = "auto"
 
-    def fit(
-        self,
-        log: "dln_jax.data.log.Log",
-        parts: "dln_jax.data.parts.Parts",
-        context: "dln_jax.learning.context.Context",
-    ) -> "Fit":
-        """Fits a sequence of candidates and keeps one."""
-        from dln_jax.learning.fits.automatic import fit
-
-        return fit(self, log, parts, context)
+    FITTED_BY = "automatic.fit"
 
 
-Way = Network | Trigonometric | Kernel | LearnedTree | Automatic
 WAYS: dict[str, type[Way]] = {
     **dict.fromkeys(
         ("structured-delan", "black-box-delan", "feed-forward", "structured-hnn", "black-box-hnn"), Network
