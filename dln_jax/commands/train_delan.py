@@ -18,7 +18,7 @@ import tyro
 from dln_jax.learning.fits.settings import Automatic, Kernel, LearnedTree, Network, Trigonometric
 from dln_jax.options import Unstated
 from dln_jax.runs.arguments import Variants
-from dln_jax.runs.options import Devices, Drawn, Filtered, Limited, Resumable, Scaled, SceneName
+from dln_jax.runs.options import Devices, Drawn, Filtered, Limited, Logged, Resumable, Scaled, SceneName
 
 NETWORK, AUTO = "structured-delan", "auto"
 ModelName = Annotated[
@@ -159,10 +159,10 @@ def train(options: Options, command: str) -> None:
     from dln_jax.learning.context import Context
     from dln_jax.learning.fit import with_uncertainty
     from dln_jax.runs.evaluation import evaluate
+    from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import finish
     from dln_jax.runs.scaled import mesh_of
-    from dln_jax.runs.stored_arguments import command_folder
     from dln_jax.time_limit import deadline
     from dln_jax.types import require_positive
 
@@ -198,7 +198,7 @@ def read(options: Options) -> Any:
     from dln_jax.data.log import log_of, read_log
     from dln_jax.data.robots import read_robot
     from dln_jax.runs.arguments import names_listed, refuse_given
-    from dln_jax.runs.logs import cutoff, facts, needs_of, refuse_facts
+    from dln_jax.runs.logs import cutoff, facts, needs_of
     from dln_jax.scenes.datasets.generators import CHARACTERS_TEST, default_data
     from dln_jax.scenes.pendulums import two_link_arm
     from dln_jax.scenes.registry import scene_named
@@ -221,7 +221,8 @@ def read(options: Options) -> Any:
         log = read_log(options.data, more=more, **facts(options), **known)
     else:
         assert scene is not None
-        refuse_facts(options)
+        of_file = [field.name for field in dataclasses.fields(Logged)]
+        refuse_given(options, of_file, "for a file: add --data")
         log = log_of(default_data(scene), f"default data of {scene.name}", cutoff=cutoff(options.cutoff), **known)
         if test is None and scene.name == "two-link-arm":
             test = ",".join(CHARACTERS_TEST)

@@ -185,10 +185,10 @@ def main(options: Options) -> None:
     from dln_jax.learning.context import Context
     from dln_jax.learning.engine.optimisers import optimiser_named
     from dln_jax.runs.arguments import require_positive_if_given
+    from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import finish
     from dln_jax.runs.scaled import mesh_of
-    from dln_jax.runs.stored_arguments import command_folder
     from dln_jax.time_limit import deadline
     from dln_jax.types import require_seed
     from dln_jax.zoo.run import save

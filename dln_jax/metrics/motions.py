@@ -76,20 +76,28 @@ def follow(
     q0: Vector,
     qd0: Vector,
     tau: Float[Array, "T d"],
+    slopes: Float[Array, "T-1 d"],
     t: Float[Array, " T"],
     *,
     substeps: int = SUBSTEPS,
-    torque: Torque = "held",
 ) -> Motion:
-    """Integrates the motion from (q0, qd0) under the torques tau at the times t by RK4; `vmap` it over trajectories.
+    """Integrates the motion from (q0, qd0) under torques by RK4; `vmap` it over trajectories.
 
-    Times are in s, with any spacing; a repeated time repeats the state. There are `substeps` RK4 steps per sample. The
-    torque "held" keeps tau[k] until t[k + 1], as published; "interpolated" is linear in between.
+    The torque is tau[k] + slopes[k] (t - t[k]) from t[k] on, with slopes from `torque_slopes`. Times are in s, with any
+    spacing; a repeated time repeats the state. There are `substeps` RK4 steps per sample.
 
-    Raises InputError if `substeps` is not positive or `torque` has another name.
+    Raises InputError if `substeps` is not positive.
     """
     require_positive(substeps=substeps)
-    return _drive(dynamics, q0, qd0, tau, torque_slopes(tau, t, torque), t, substeps)
+
+    def rate(state, tau):
+        q, qd, _ = state
+        # The work changes at the rate of the energy, including friction.
+        at_work = tau - dynamics.friction(q, qd) if isinstance(dynamics, Dynamics) else tau
+        return qd, dynamics.forward_dynamics(q, qd, tau), qd @ at_work
+
+    start = q0, qd0, jnp.zeros_like(q0[0])
+    return Motion(*driven(rate, start, tau[:-1], slopes, jnp.diff(t), substeps=substeps, method=looped_rk4))
 
 
 def motion_program(
@@ -106,7 +114,7 @@ def motion_program(
         q0, qd0, tau, t = records
 
         def drive(q0, qd0, tau, t, slopes):
-            motion = _drive(dynamics, q0, qd0, tau, slopes, t, SUBSTEPS)
+            motion = follow(dynamics, q0, qd0, tau, slopes, t)
             energy = jax.vmap(dynamics.energy)(motion.q, motion.qd) if isinstance(dynamics, Dynamics) else None
             return motion, energy
 
@@ -360,19 +368,6 @@ def prediction_metrics(
     }
 
 
-def _drive(dynamics: Dynamics | PlainDynamics, q0, qd0, tau, slopes, t, substeps: int) -> Motion:
-    """Integrates with the torque tau[k] + slopes[k] (t - t[k]) from t[k] on; the work done is a third state."""
-
-    def rate(state, tau):
-        q, qd, _ = state
-        # The work changes at the rate of the energy, including friction.
-        at_work = tau - dynamics.friction(q, qd) if isinstance(dynamics, Dynamics) else tau
-        return qd, dynamics.forward_dynamics(q, qd, tau), qd @ at_work
-
-    start = q0, qd0, jnp.zeros_like(q0[0])
-    return Motion(*driven(rate, start, tau[:-1], slopes, jnp.diff(t), substeps=substeps, method=looped_rk4))
-
-
 # Compiled once per model and shape, for all parameters and motions.
 @functools.partial(jax.jit, static_argnames=("model", "fitted", "torque", "substeps", "momenta"))
 def _predict(
@@ -384,7 +379,8 @@ def _predict(
     def states_and_work(start, t, tau):
         if momenta:
             return phase_motion(flow(energies), start, t, substeps=substeps), None
-        motion = follow(dynamics(energies), start[:d], start[d:], tau, t, substeps=substeps, torque=torque)
+        slopes = torque_slopes(tau, t, torque)
+        motion = follow(dynamics(energies), start[:d], start[d:], tau, slopes, t, substeps=substeps)
         return jnp.concatenate([motion.q, motion.qd], axis=1), motion.work
 
     def one(t, q, qd, tau, weight):

@@ -22,10 +22,9 @@ _rules = ConstructorRegistry()
 @_rules.primitive_rule
 def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     """Reads int and float, with error messages in the style of all others."""
-    kinds = {int: "a whole number", float: "a number"}
-    if info.type not in kinds:
+    kind, wanted = info.type, {int: "a whole number", float: "a number"}.get(info.type)
+    if wanted is None:
         return None
-    kind, wanted = info.type, kinds[info.type]
 
     def read(words: list[str]) -> Any:
         try:
@@ -88,10 +87,8 @@ def arguments_of(arguments: type, **stated: Any) -> Any:
     return whole(**stated)
 
 
-def parse(
-    arguments: type, *, prog: str, description: str | None, line: Sequence[str], common: type | None = None
-) -> Any:
-    """Parses a command line; `--help` prints the help and exits.
+def parse(arguments: type, *, prog: str, description: str | None, line: Sequence[str], common: type) -> tuple[Any, Any]:
+    """Parses a command line into the command's own and the common options; `--help` prints the help and exits.
 
     Args:
         prog: the command as the user typed it.
@@ -105,10 +102,8 @@ def parse(
     def refuse(event: ParseErrorEvent) -> None:
         raise InputError(f"{_complaint(event, arguments)} (see {prog} --help)")
 
-    fields: list[Any] = [("own", Annotated[whole, tyro.conf.arg(name="")])]
-    if common is not None:
-        fields.append(("common", Annotated[common, tyro.conf.arg(name="")]))
-    both = dataclasses.make_dataclass("Whole", fields)
+    unnamed = tyro.conf.arg(name="")
+    both: Any = tuple[Annotated[whole, unnamed], Annotated[common, unnamed]]
     with on_parse_error(refuse):
         return tyro.cli(both, prog=prog, description=description, args=line, registry=_rules)
 

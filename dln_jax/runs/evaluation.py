@@ -24,17 +24,24 @@ from dln_jax.learning.kinematics.fit import TreeFit
 from dln_jax.learning.latency import latency_of
 from dln_jax.learning.linear import design, design_chunks
 from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction.curves import joint_dissipation
 from dln_jax.mechanics.trees.recursions import tree_system
-from dln_jax.metrics.coverage import LEVEL, coverage
-from dln_jax.metrics.errors import as_arrays, definiteness, errors, mean_square, prediction_program, samples_of
+from dln_jax.metrics.errors import (
+    LEVEL,
+    as_arrays,
+    coverage,
+    definiteness,
+    errors,
+    mean_square,
+    prediction_program,
+    samples_of,
+)
 from dln_jax.metrics.motions import Motion, by_trajectory, metrics_of_motions, motion_program, records_of
 from dln_jax.metrics.verdict import FAR_FROM_NOISE, HeldOut, Verdict, held_out, judge, verdict_metrics, worst
 from dln_jax.models.model import Model
 from dln_jax.models.uncertainty import Uncertainty, deviation_of_rows, exceeds, scores_of_rows
-from dln_jax.runs.report import Report, png
+from dln_jax.runs.report import Report, cost_metrics, png
 from dln_jax.types import InputError
 
 SUMMARIES = {"median": np.median, "mean": np.mean, "standard_deviation": np.std, "largest": np.max}
@@ -111,7 +118,7 @@ def evaluate(
     answers = as_arrays(predict(fit.parameters, samples))
     predicted = {name: array[: len(test.t)] for name, array in answers.items()}
     motions, of_rollouts = rollouts(fit, test, log, say)
-    verdict, of_verdict = verdict_of(fit, fit.dynamics, parts, log, answers, motions)
+    verdict, of_verdict = verdict_of(fit, parts, log, answers, motions)
     spread, seeds = {}, np.size(fit.seeds)
     if seeds > 1:
         of_seeds = [predict(fit.of_seed(index), samples)["tau"] for index in range(seeds)]
@@ -120,7 +127,6 @@ def evaluate(
     figures = figures_of(fit, parts, log, motions, predicted)
     of_bands, of_figures = bands_of(fit, test, predicted["tau"])
     figures |= of_figures
-    latency = latency_of(fit, test)
     validation = np.ravel(training.validation)
     metrics = {
         **errors(predicted, test),
@@ -130,13 +136,12 @@ def evaluate(
         **of_bands,
         **of_rollouts,
         **({"validation_error": float(validation[fit.best])} if training.history else {}),
-        "parameters": sum(np.size(leaf) for leaf in jax.tree.leaves(fit.parameters)),
-        "steps": training.stop.step,
-        "best_step": int(np.ravel(training.best_step)[fit.best]),
-        "compile_seconds": training.compile_seconds,
-        "train_seconds": training.train_seconds,
-        "one_step_p50_us": latency.p50_us,
-        "one_step_p99_us": latency.p99_us,
+        **cost_metrics(
+            training,
+            latency_of(fit, test),
+            parameters=sum(np.size(leaf) for leaf in jax.tree.leaves(fit.parameters)),
+            best_step=int(np.ravel(training.best_step)[fit.best]),
+        ),
     }
     return Report(
         metrics=metrics,
@@ -180,7 +185,6 @@ def rollouts(
 
 def verdict_of(
     fit: Fit,
-    functions: Dynamics | PlainDynamics,
     parts: Parts,
     log: Log,
     answers: dict[str, np.ndarray],
@@ -191,7 +195,6 @@ def verdict_of(
     Accelerations are judged if the model is fitted to them.
 
     Args:
-        functions: the model's.
         answers: the model's `tau` and `qdd` [N, d] on the test motions, followed by the validation motions.
         motions: rollouts of the test motions, possibly none.
     """
@@ -223,7 +226,7 @@ def verdict_of(
         reason = f"{infinite} of {len(motions)} rollouts of test motions are not finite"
         verdicts.append(Verdict("doubtful", reason, remedy))
     if fit.properties.energy and not fit.properties.definite:
-        definite = definiteness(functions, whole.q, whole.qd)
+        definite = definiteness(fit.dynamics, whole.q, whole.qd)
         if (share := definite.share_not_definite) > 0:
             reason = (
                 f"the mass matrix is not positive definite at {share:.1%} of the states of the data: accelerations and "
@@ -290,7 +293,7 @@ def bands_of(
     if fit.uncertainty is None:
         return {}, {}
     std, out_of_distribution = bands(double(fit), fit.parameters, fit.uncertainty, test)
-    shares = coverage(predicted - test.tau, std, levels=(LEVEL,)).shares[0]
+    shares = coverage(predicted - test.tau, std, levels=(LEVEL,))[0]
     metrics = {
         "coverage_95_share": float(shares.mean()),
         "coverage_95_worst_joint_share": float(shares[np.argmax(abs(shares - LEVEL))]),

@@ -3,7 +3,7 @@
 from typing import Any
 
 from dln_jax.data.stated_needs import needs_from_text
-from dln_jax.runs.arguments import names_listed, numbers_of, refuse_given
+from dln_jax.runs.arguments import names_listed, numbers_of
 from dln_jax.runs.options import Checked, Filtered, Logged
 from dln_jax.types import InputError, Needs, require_once
 
@@ -18,11 +18,6 @@ def facts(options: Logged) -> dict[str, Any]:
     if isinstance(options, Filtered):
         stated["cutoff"] = cutoff(options.cutoff)
     return stated
-
-
-def refuse_facts(options: Logged) -> None:
-    """Refuses facts on a file where none is given."""
-    refuse_given(options, ["rate", "units", "joints", "topics", "torque_factor"], "for a file: add --data")
 
 
 def torque_factor(text: str) -> float | tuple[float, ...] | dict[str, float]:

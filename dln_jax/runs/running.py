@@ -48,21 +48,21 @@ def run(
         description = description or sys.modules[main.__module__].__doc__
         line = sys.argv[1:] if line is None else line
         try:
-            whole = parse(arguments, prog=prog, description=description, line=line, common=common)
+            own, shared = parse(arguments, prog=prog, description=description, line=line, common=common)
         finally:
             sys.stdout.flush()  # the help; raises BrokenPipeError here if its reader has closed the pipe
-        require_possible(whole.own)
+        require_possible(own)
         # JAX takes a second to import, which the help and a mistake do not need.
         from dln_jax.runs import compilation_cache, scaled
-        from dln_jax.runs.stored_arguments import with_stored_arguments
+        from dln_jax.runs.folder import with_stored_arguments
         from dln_jax.scale import processes
 
         # Data and references are float64; models state their own precision.
         compilation_cache.enable_double_precision()
-        member = scaled.membership_in(whole.own)
-        options = with_stored_arguments(whole.own, arguments) if getattr(whole.own, "resume", False) else whole.own
-        before = compilation_cache.compilation() if from_shell else None
-        unkept = compilation_cache.keep(whole.common.compilation_cache) if from_shell else ""
+        member = scaled.membership_in(own)
+        options = with_stored_arguments(own, arguments) if getattr(own, "resume", False) else own
+        before = compilation_cache.compilation().copy() if from_shell else None
+        unkept = compilation_cache.keep(shared.compilation_cache) if from_shell else ""
 
     began = IMPORTED if from_shell else time.perf_counter()
 

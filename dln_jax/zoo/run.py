@@ -22,8 +22,17 @@ from dln_jax.models.uncertainty import Uncertainty, predictive
 from dln_jax.precision import data_type, require_double_precision
 from dln_jax.types import InputError, VectorLike
 from dln_jax.zoo.descriptions import OWN, Description, build
-from dln_jax.zoo.parameter_files import MODEL, REMEDY, VALUE, load_manifest, load_tree, require_fitting, save_tree
-from dln_jax.zoo.uncertainty_files import discard_uncertainty, load_uncertainty
+from dln_jax.zoo.parameter_files import (
+    MODEL,
+    REMEDY,
+    VALUE,
+    discard_uncertainty,
+    load_manifest,
+    load_tree,
+    load_uncertainty,
+    require_fitting,
+    save_tree,
+)
 
 if TYPE_CHECKING:
     from dln_jax.zoo.value_functions import ValueRun

@@ -76,7 +76,7 @@ def test_energy_is_the_work_of_the_torque_less_friction():
     """A damped oscillator from rest under a held torque: the work is ∫ qd (tau - friction qd) dt."""
     system = damped_oscillator()
     t, tau = jnp.linspace(0.0, 2.0, 41), jnp.full((41, 1), 1.5)
-    motion = jax.jit(lambda: follow(system, jnp.zeros(1), jnp.zeros(1), tau, t))()
+    motion = jax.jit(lambda: follow(system, jnp.zeros(1), jnp.zeros(1), tau, jnp.zeros((40, 1)), t))()
     frequency = np.sqrt(8 - FRICTION**2 / 4)
     qd = 1.5 / frequency * np.exp(-FRICTION / 2 * t) * np.sin(frequency * t)
     assert_allclose(motion.qd[:, 0], qd, atol=1e-9)

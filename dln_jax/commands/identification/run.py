@@ -49,9 +49,9 @@ from dln_jax.runs.arguments import (
     require_positive_if_given,
 )
 from dln_jax.runs.evaluation import bands_of
+from dln_jax.runs.folder import command_folder
 from dln_jax.runs.logs import facts
 from dln_jax.runs.report import Report, finish, png
-from dln_jax.runs.stored_arguments import command_folder
 from dln_jax.types import FrictionLaw, InputError
 from dln_jax.zoo.descriptions import Description
 
