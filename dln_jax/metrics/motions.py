@@ -1,6 +1,6 @@
 """Predictions of motions under recorded torques, the time until they fail, and their energy.
 
-    VPT = first t with sum_j (q_j - q_hat_j)² / var(q_j) >= threshold        (valid prediction time)
+    VPT = first t with sum_j (q_j - q_hat_j)² / var(q_j) >= THRESHOLD        (valid prediction time)
     E(t) - E(0) = work of tau - work lost to friction                        (energy balance)
 
 Motions start from a recorded state (`motion_program`) or, for measured coordinates, from a state that is fitted to
@@ -39,6 +39,8 @@ TORQUES: tuple[Torque, ...] = ("held", "interpolated")
 """Kinds of torque between two samples; all are compared."""
 SUBSTEPS = 20
 """RK4 steps per sample, as published."""
+THRESHOLD = 1e-2
+"""Squared error over the variance, summed over coordinates, at which a prediction has failed, as published."""
 
 
 class Motion(NamedTuple):
@@ -48,16 +50,6 @@ class Motion(NamedTuple):
     qd: Float[Array | np.ndarray, "*K T d"]
     work: Float[Array | np.ndarray, "*K T"]
     """Energy supplied by tau minus the loss to friction since the start, in J."""
-
-
-class Records(NamedTuple):
-    """Records of K trajectories, padded to one length T by repeating their last samples."""
-
-    q0: Float[Array, "K d"]
-    qd0: Float[Array, "K d"]
-    tau: Float[Array, "K T d"]
-    t: Float[Array, "K T"]
-    """Time since the start of the trajectory, in s."""
 
 
 class Predictions(NamedTuple):
@@ -102,14 +94,14 @@ def follow(
 
 def motion_program(
     dynamics_of: Callable[[Any], Dynamics | PlainDynamics],
-) -> Callable[[Any, Records], tuple[Motion, Array | None]]:
+) -> Callable[[Any, tuple[Array, ...]], tuple[Motion, Array | None]]:
     """Returns (parameters, records) -> motions and their energies, for `jax.jit`; leading axes [TORQUES, trajectories].
 
     Energies, in J, are those of the predicting system at its own states; `None` for a system without energy. Parameters
     are arguments of the program, not constants in it, so one compilation serves every seed.
     """
 
-    def motions(parameters: Any, records: Records) -> tuple[Motion, Array | None]:
+    def motions(parameters: Any, records: tuple[Array, ...]) -> tuple[Motion, Array | None]:
         dynamics = dynamics_of(parameters)
         q0, qd0, tau, t = records
 
@@ -124,8 +116,11 @@ def motion_program(
     return motions
 
 
-def records_of(data: Trajectories, dtype: DTypeLike | None) -> Records:
-    """Returns the records for a `motion_program`, in `dtype` (JAX's default if `None`).
+def records_of(data: Trajectories, dtype: DTypeLike | None) -> tuple[Array, ...]:
+    """Returns the records of K trajectories for a `motion_program`, in `dtype` (JAX's default if `None`).
+
+    These are the first q and qd [K, d], tau [K, T, d], and the times [K, T] since the start of the trajectory, in s.
+    They are padded to one length T by repeating the last samples.
 
     Raises:
         InputError: a trajectory has a single sample.
@@ -137,7 +132,7 @@ def records_of(data: Trajectories, dtype: DTypeLike | None) -> Records:
     first = padded[:, 0]
     # Times are counted from the start of a trajectory before they are rounded to `dtype`.
     t = data.t[padded] - data.t[first][:, None]
-    return Records(*(jnp.asarray(array, dtype) for array in (data.q[first], data.qd[first], data.tau[padded], t)))
+    return tuple(jnp.asarray(array, dtype) for array in (data.q[first], data.qd[first], data.tau[padded], t))
 
 
 def by_trajectory(motions: Motion, data: Trajectories) -> dict[Torque, list[Motion]]:
@@ -195,12 +190,12 @@ def cut_segments(data: Trajectories, samples: int, *, every: int) -> MeasuredWin
     return MeasuredWindows(t - t[:, :1], data.q[rows], data.qd[rows], data.tau[rows], np.ones(rows.shape))
 
 
-def grid_places(t: Float[np.ndarray, " N"], *, gap: float = GAP) -> Int[np.ndarray, " N"]:
+def grid_places(t: Float[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
     """Returns the samples' indices on a grid of their own time steps; within a gap, steps are at most the median."""
     steps = np.diff(t)
     median = np.median(steps) if len(steps) else 1.0
     # Rounding of the times must not add a step to a gap of an integer number of steps.
-    counts = np.where(steps > gap * median, np.ceil(steps / median - 1e-6), 1).astype(int)
+    counts = np.where(steps > GAP * median, np.ceil(steps / median - 1e-6), 1).astype(int)
     return np.concatenate([[0], np.cumsum(counts)])
 
 
@@ -227,16 +222,16 @@ def predict_measured(
     segments: MeasuredWindows,
     *,
     fitted: int,
-    torque: Torque = "interpolated",
     substeps: int = 1,
     momenta: bool = False,
 ) -> Predictions:
     """Predicts motions from initial states fitted to the first `fitted` samples of q; weight 0 means unmeasured.
 
+    Torques are interpolated between samples.
+
     Args:
         model: a model of any energies, or of accelerations.
         fitted: number of samples for fitting the initial state, at least 2.
-        torque: torque between samples, "held" or "interpolated".
         substeps: RK4 steps between two samples.
         momenta: whether the model is a flow of (q, p), without torques, with p close to qd; its p is returned as qd.
 
@@ -247,9 +242,8 @@ def predict_measured(
         raise InputError(f"fitted is {fitted}; expected 2 samples or more, and fewer than the {segments.t.shape[1]}")
     spread = segments.q.reshape(-1, segments.q.shape[2]).std(axis=0)
     scale = jnp.asarray(np.where(spread > 0, spread, 1.0))
-    options = {"scale": scale, "fitted": fitted, "torque": torque, "substeps": substeps, "momenta": momenta}
-    predicted = _predict(model, parameters, *map(jnp.asarray, segments), **options)
-    return Predictions(*map(np.asarray, predicted))
+    measured = MeasuredWindows(*map(jnp.asarray, segments))
+    return Predictions(*map(np.asarray, _predict(model, parameters, measured, scale, fitted, substeps, momenta)))
 
 
 def valid_prediction_time(
@@ -257,32 +251,27 @@ def valid_prediction_time(
     q_hat: Float[np.ndarray, "T d"],
     t: Float[np.ndarray, " T"],
     variance: Float[np.ndarray, " d"],
-    *,
-    threshold: float = 1e-2,
 ) -> float:
-    """Returns the time in s from the start to the first sample with sum_j (q_j - q_hat_j)² / variance_j >= threshold.
+    """Returns the time in s from the start to the first sample with sum_j (q_j - q_hat_j)² / variance_j >= THRESHOLD.
 
     If there is none, returns the whole duration. A prediction that is not finite has failed at that sample.
     """
     # A diverging prediction may overflow; infinity exceeds the threshold, and NaN is not below it.
     with np.errstate(over="ignore", invalid="ignore"):
-        failed = ~(np.sum((q - q_hat) ** 2 / variance, axis=1) < threshold)
+        failed = ~(np.sum((q - q_hat) ** 2 / variance, axis=1) < THRESHOLD)
     last = int(np.argmax(failed)) if failed.any() else len(t) - 1
     return float(t[last] - t[0])
 
 
-def valid_prediction_times(
-    data: Trajectories, motions: list[Motion], *, threshold: float = 1e-2
-) -> Float[np.ndarray, " K"]:
+def valid_prediction_times(data: Trajectories, motions: list[Motion]) -> Float[np.ndarray, " K"]:
     """Returns the trajectories' valid prediction times in s; the variance of q_j is over all samples of the data.
 
-    Raises InputError if a coordinate is the same in all samples, or the threshold is not positive.
+    Raises InputError if a coordinate is the same in all samples.
     """
-    require_positive(threshold=threshold)
     variance = _variance(data.q, "q")
     return np.array(
         [
-            valid_prediction_time(data.q[group], np.asarray(motion.q), data.t[group], variance, threshold=threshold)
+            valid_prediction_time(data.q[group], np.asarray(motion.q), data.t[group], variance)
             for group, motion in zip(_samples(data), motions, strict=True)
         ]
     )
@@ -369,17 +358,14 @@ def prediction_metrics(
 
 
 # Compiled once per model and shape, for all parameters and motions.
-@functools.partial(jax.jit, static_argnames=("model", "fitted", "torque", "substeps", "momenta"))
-def _predict(
-    model: Model, parameters, t, q, qd, tau, weight, *, scale, fitted: int, torque: Torque, substeps: int, momenta
-):
-    energies = model.energies(parameters)
-    d = q.shape[2]
+@functools.partial(jax.jit, static_argnames=("model", "fitted", "substeps", "momenta"))
+def _predict(model: Model, parameters, segments: MeasuredWindows, scale, fitted: int, substeps: int, momenta: bool):
+    energies, d = model.energies(parameters), len(scale)
 
     def states_and_work(start, t, tau):
         if momenta:
             return phase_motion(flow(energies), start, t, substeps=substeps), None
-        slopes = torque_slopes(tau, t, torque)
+        slopes = torque_slopes(tau, t, "interpolated")
         motion = follow(dynamics(energies), start[:d], start[d:], tau, slopes, t, substeps=substeps)
         return jnp.concatenate([motion.q, motion.qd], axis=1), motion.work
 
@@ -403,7 +389,7 @@ def _predict(
         kinetic = jax.vmap(lambda q, qd: 0.5 * qd @ system.mass_matrix(q, qd) @ qd)(q, qd)
         return q, qd, growth, jnp.max(jnp.abs(energy - energy[0] - work)) / jnp.max(kinetic)
 
-    return jax.vmap(one)(t, q, qd, tau, weight)
+    return jax.vmap(one)(*segments)
 
 
 def _samples(data: Trajectories) -> list[np.ndarray]:

@@ -41,7 +41,7 @@ from dln_jax.metrics.motions import Motion, by_trajectory, metrics_of_motions, m
 from dln_jax.metrics.verdict import FAR_FROM_NOISE, HeldOut, Verdict, held_out, judge, verdict_metrics, worst
 from dln_jax.models.model import Model
 from dln_jax.models.uncertainty import Uncertainty, deviation_of_rows, exceeds, scores_of_rows
-from dln_jax.runs.report import Report, cost_metrics, png
+from dln_jax.runs.report import Report, cost_metrics, number, png, unit_of
 from dln_jax.types import InputError
 
 SUMMARIES = {"median": np.median, "mean": np.mean, "standard_deviation": np.std, "largest": np.max}
@@ -53,41 +53,36 @@ CEILINGS = {
     "energy_error_j": "energy_error_ceiling_j",
 }
 """Rollout metrics and the names of the true plant's values."""
-FORCE = "force²"
-"""Unit of squared errors of torques, which depends on the joints."""
-METRICS = {
-    "torque_mse": ("torque, mean square error", FORCE, ".2e"),
-    "test_nmse": ("torque, error over variance, mean of joints", "1", ".2e"),
-    "validation_nmse": ("the same, on validation motions", "1", ".2e"),
-    "zero_nmse": ("the same, of a guess of zero", "1", ".2e"),
-    "noise_nmse": ("the same, of the noise of the torques", "1", ".2e"),
-    "file_nmse": ("the same, of the robot's file", "1", ".2e"),
-    "forward_mse": ("acceleration, mean square error", "(1/s²)²", ".2e"),
-    "validation_error": ("validation error, sum over joints", FORCE, ".2e"),
-    "power_mse": ("power, mean square error", "W²", ".2e"),
-    "inertial_mse": ("inertial force, mean square error", FORCE, ".2e"),
-    "coriolis_mse": ("Coriolis force, mean square error", FORCE, ".2e"),
-    "gravity_mse": ("gravity force, mean square error", FORCE, ".2e"),
-    "gravity_determined": ("gravity told from friction: 1 yes, 0 known only in sum", "", ","),
-    "smallest_mass_eigenvalue": ("smallest eigenvalue of the mass matrix", "", ".2e"),
-    "share_not_definite": ("states where the mass matrix is not definite", "", ",.2f"),
-    "largest_condition_number": ("largest condition number of the mass matrix", "", ".2e"),
-    "coverage_95_share": ("torques within the 95 % band", "", ",.2f"),
-    "coverage_95_worst_joint_share": ("the same, at the joint furthest from 95 %", "", ",.2f"),
-    "out_of_distribution_share": ("states out of distribution", "", ",.2f"),
-    "vpt_seconds": ("valid prediction time, torque held", "s", ",.2f"),
-    "vpt_interpolated_seconds": ("valid prediction time, torque interpolated", "s", ",.2f"),
-    "rollout_seconds": ("duration of a test motion", "s", ",.1f"),
-    "normalised_state_error": ("state error of a rollout, in standard deviations", "1", ".2e"),
-    "energy_error_j": ("energy balance error of a rollout", "J", ".2e"),
-    "one_step_p50_us": ("one call of the inverse model, median", "µs", ",.1f"),
-    "one_step_p99_us": ("one call of the inverse model, 99 %", "µs", ",.1f"),
-    "compile_seconds": ("compile seconds", "s", ",.1f"),
-    "train_seconds": ("train seconds", "s", ",.1f"),
-    "twin_degrees": ("twin degrees", "", ",.1f"),
-    "twin_metres": ("twin metres", "", ",.1f"),
+LABELS = {
+    "torque_mse": "torque, mean square error",
+    "test_nmse": "torque, error over variance, mean of joints",
+    "validation_nmse": "the same, on validation motions",
+    "zero_nmse": "the same, of a guess of zero",
+    "noise_nmse": "the same, of the noise of the torques",
+    "file_nmse": "the same, of the robot's file",
+    "forward_mse": "acceleration, mean square error",
+    "validation_error": "validation error, sum over joints",
+    "power_mse": "power, mean square error",
+    "inertial_mse": "inertial force, mean square error",
+    "coriolis_mse": "Coriolis force, mean square error",
+    "gravity_mse": "gravity force, mean square error",
+    "gravity_determined": "gravity told from friction: 1 yes, 0 known only in sum",
+    "smallest_mass_eigenvalue": "smallest eigenvalue of the mass matrix",
+    "share_not_definite": "states where the mass matrix is not definite",
+    "largest_condition_number": "largest condition number of the mass matrix",
+    "coverage_95_share": "torques within the 95 % band",
+    "coverage_95_worst_joint_share": "the same, at the joint furthest from 95 %",
+    "out_of_distribution_share": "states out of distribution",
+    "vpt_seconds": "valid prediction time, torque held",
+    "vpt_interpolated_seconds": "valid prediction time, torque interpolated",
+    "rollout_seconds": "duration of a test motion",
+    "normalised_state_error": "state error of a rollout, in standard deviations",
+    "energy_error_j": "energy balance error of a rollout",
+    "one_step_p50_us": "one call of the inverse model, median",
+    "one_step_p99_us": "one call of the inverse model, 99 %",
 }
-"""Label, unit and format of a metric by its name; other names explain themselves."""
+"""Labels of metrics; other names explain themselves."""
+UNITS = {"forward_mse": "(1/s²)²", "power_mse": "W²", "normalised_state_error": "1", "energy_error_j": "J"}
 AT_NOISE = 2.0
 """Held-out errors of a tree with unknown frames, in units of the noise variance, up to which its frames are right;
 above `FAR_FROM_NOISE` they may be wrong."""
@@ -143,11 +138,12 @@ def evaluate(
             best_step=int(np.ravel(training.best_step)[fit.best]),
         ),
     }
+    columns, rows = table_of(metrics, fit)
     return Report(
         metrics=metrics,
-        rows=rows_of(metrics, fit),
+        rows=rows,
         title=f"test on {log.name}, {fit.description['precision']}",
-        columns=columns_of(metrics),
+        columns=columns,
         verdict=verdict,
         figures=figures,
         chosen=choices_of(fit, parts, log),
@@ -346,33 +342,23 @@ def figures_of(
     return figures
 
 
-def columns_of(metrics: dict[str, float | int]) -> tuple[str, ...]:
-    """Columns of the printed table, with one for the true plant if it is known."""
+def table_of(metrics: dict[str, float | int], fit: Fit) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Columns and rows of the printed table; rollout metrics also show the true plant's values, if it is known."""
+    force = "(N m)²" if set(fit.needs.joints) == {"revolute"} else "(N m or N)²"
+    units = {**UNITS, "validation_error": force if fit.objective.selects_by == "torque" else "1"}
     known = any(ceiling in metrics for ceiling in CEILINGS.values())
-    return ("quantity", "value", *["true plant"] * known, "unit")
-
-
-def rows_of(metrics: dict[str, float | int], fit: Fit) -> list[tuple[str, ...]]:
-    """Rows of the printed table; rollout metrics also show the true plant's values."""
-    force = "N m" if set(fit.needs.joints) == {"revolute"} else "N m or N"
-    known = len(columns_of(metrics)) == 4
     lines = []
     for key, value in metrics.items():
         if key in CEILINGS.values() or key == "verdict":
             continue
-        label, unit, form = METRICS.get(key) or (
-            key.replace("_", " "),
-            FORCE if "_mse" in key else "",
-            "," if isinstance(value, int) else ".2e",
-        )
-        if key == "validation_error" and fit.objective.selects_by != "torque":
-            unit = "1"
+        unit = "1" if "_nmse" in key else force if "_mse" in key else ""
         ceiling = metrics.get(CEILINGS.get(key, ""))
-        beside = ["" if ceiling is None else f"{ceiling:{form}}"] * known
-        lines.append((label, f"{value:{form}}", *beside, f"({force})²" if unit == FORCE else unit))
+        beside = ["" if ceiling is None else number(key, ceiling)] * known
+        label = LABELS.get(key, key.replace("_", " "))
+        lines.append((label, number(key, value), *beside, units.get(key, unit) or unit_of(key, {})))
     calls = f"{1e6 / metrics['one_step_p50_us']:,.0f}"
     lines.append(("calls of the inverse model", calls, *[""] * known, "1/s"))
-    return lines
+    return ("quantity", "value", *["true plant"] * known, "unit"), lines
 
 
 def choices_of(fit: Fit, parts: Parts, log: Log) -> dict[str, Any]:

@@ -134,8 +134,8 @@ def _checked(path: Path, values: Mapping[str, Any], arguments: type) -> Any:
 
 
 @contextlib.contextmanager
-def command_folder(options: Any, command: str, **chosen: Any) -> Iterator[Path]:
-    """Yields the run folder of a command. config.json gets the arguments, and the values `chosen` from them."""
+def command_folder(options: Any, command: str) -> Iterator[Path]:
+    """Yields the run folder of a command. config.json gets the arguments."""
     resume = getattr(options, "resume", False)
     folder_of_run = (
         run_folder(options.out, command, resume=resume, resumable=hasattr(options, "resume"))
@@ -146,7 +146,7 @@ def command_folder(options: Any, command: str, **chosen: Any) -> Iterator[Path]:
         if resume:
             wait_for_all(options)
         else:
-            write_config(folder, options, **chosen)
+            write_config(folder, options)
         yield folder
 
 

@@ -3,9 +3,9 @@
 from typing import Any
 
 from dln_jax.data.stated_needs import needs_from_text
-from dln_jax.runs.arguments import names_listed, numbers_of
+from dln_jax.runs.arguments import names_listed, numbers_of, pairs_of
 from dln_jax.runs.options import Checked, Filtered, Logged
-from dln_jax.types import InputError, Needs, require_once
+from dln_jax.types import InputError, Needs
 
 
 def facts(options: Logged) -> dict[str, Any]:
@@ -24,10 +24,8 @@ def torque_factor(text: str) -> float | tuple[float, ...] | dict[str, float]:
     """Parses --torque-factor: a number, one for each joint, or NAME=NUMBER."""
     option = "--torque-factor"
     if "=" in text:
-        pairs = [entry.partition("=") for entry in text.split(",")]
-        names = [name.strip() for name, _, _ in pairs]
-        require_once(option, names)
-        return {name: numbers_of(f"{option} {name}", pair[2], [1])[0] for name, pair in zip(names, pairs, strict=True)}
+        pairs = pairs_of(option, text.split(","))
+        return {name: numbers_of(f"{option} {name}", factor, [1])[0] for name, factor in pairs.items()}
     numbers = numbers_of(option, text)
     return numbers[0] if len(numbers) == 1 else numbers
 

@@ -18,13 +18,10 @@ from dln_jax.commands.identification.motions import (
 )
 from dln_jax.commands.identification.verdict import Predict, judge_robot
 from dln_jax.commands.identify import LAWS, NO_FRICTION, TEMPERATURE, Arguments
-from dln_jax.compilation import quick_compilation
-from dln_jax.data.encoders.sampling import torque_noise
 from dln_jax.data.log import SPLIT, read_log
 from dln_jax.data.parts import Parts, split_log
 from dln_jax.data.robot_files import write_robot
 from dln_jax.data.robots import Robot, read_robot
-from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, is_cut
 from dln_jax.figures.torques import friction_curves, torque_by_joint
 from dln_jax.files import write_bytes, write_json
@@ -48,7 +45,7 @@ from dln_jax.runs.arguments import (
     refuse_given,
     require_positive_if_given,
 )
-from dln_jax.runs.evaluation import bands_of
+from dln_jax.runs.evaluation import bands_of, compiled
 from dln_jax.runs.folder import command_folder
 from dln_jax.runs.logs import facts
 from dln_jax.runs.report import Report, finish, png
@@ -77,6 +74,7 @@ def run(options: Arguments) -> None:
     of_file = {"needs": robot.tree.needs, "needs_origin": "the robot's file", "settled": SETTLED, "more": more}
     log = read_log(options.data, robot=robot, **of_file, **facts(options))
     robot = log.robot or robot
+    log = log._replace(robot=robot)
     tree, names = robot.tree, robot.tree.names
     motors, coupled = stated_motors(options, tree.degrees_of_freedom)
     if cooling:
@@ -152,21 +150,15 @@ def run(options: Arguments) -> None:
         metrics |= {f"noise_joint_{k + 1}": float(value) for k, value in enumerate(solution.fit.noise)}
         if solution.consistent is not None:
             metrics["consistent_iterations"] = solution.consistent.iterations
-        times: dict[str, float] = {}
         if motions:
+            variance = spread_of(*motions)
             for name, theta in {"vpt_seconds": solution.theta, "by_torques_vpt_seconds": by_torques}.items():
-                tried = parameters_of(theta, known)
-                predicted_times, times["predicted_seconds"] = prediction_times(
-                    model, tried, motions[1], spread_of(*motions)
-                )
-                times[name] = float(np.mean(predicted_times))
-            of_motions += motion_lines(options.by, by_motions, times)
-        whole = False
+                times, length = prediction_times(model, parameters_of(theta, known), motions[1], variance)
+                metrics |= {"predicted_seconds": length, name: float(np.mean(times))}
+            of_motions += motion_lines(options.by, by_motions, metrics)
         if by_motions is not None:
-            times |= {"delay_seconds": by_motions.delay, "rounds": by_motions.rounds}
-            times |= {"motion_rms_before": by_motions.before, "motion_rms": by_motions.after}
-            whole = bool(np.isclose(times["vpt_seconds"], times["predicted_seconds"]))
-        metrics |= times
+            metrics |= {"delay_seconds": by_motions.delay, "rounds": by_motions.rounds}
+            metrics |= {"motion_rms_before": by_motions.before, "motion_rms": by_motions.after}
         verdict, of_verdict = judge_robot(
             solution,
             known,
@@ -175,11 +167,9 @@ def run(options: Arguments) -> None:
             train,
             test,
             torques,
-            names,
-            noise=torque_noise(train) if log.torque_noise is None else log.torque_noise,
-            causes=log.faults,
+            log,
             robust=options.robust,
-            whole=whole,
+            whole=by_motions is not None and bool(np.isclose(metrics["vpt_seconds"], metrics["predicted_seconds"])),
         )
         metrics |= of_verdict
 
@@ -188,7 +178,19 @@ def run(options: Arguments) -> None:
         if options.figures:
             figures["torque.png"] = png(torque_by_joint, test, torques[FITTED], names, units)
             if description["needs"]["joint_friction"]:
-                figures["friction.png"] = friction_figure(predict, parameters, test, *predicted[FITTED], names, units)
+                # All joints at once, each over its own range: friction in a joint does not depend on the others.
+                rates = np.linspace(test.qd.min(axis=0), test.qd.max(axis=0), len(test.t))
+                still = np.zeros_like(rates)
+                curves = predict(parameters, test._replace(q=still, qd=rates, qdd=still))[1]
+                torque, friction = predicted[FITTED]
+                figures["friction.png"] = png(
+                    friction_curves,
+                    {"identified": (rates, curves)},
+                    names=names,
+                    force_unit=units,
+                    measured=(test.qd, test.tau - (torque - friction)),
+                    rate_unit=["rad/s" if unit == "N m" else "m/s" for unit in units],
+                )
         if options.uncertainty:
             try:
                 inner = Parts(Split(*inner_split(train), test))
@@ -254,10 +256,10 @@ def stated_motors(options: Arguments, d: int) -> tuple[Rows | None, tuple[Pair, 
                 f"--motors has {len(rows)} rows; expected {d}, one for each motor, separated by semicolons"
             )
     for pair in names_listed(options.coupled):
-        joints = pair.partition(":")[::2]
-        if not all(joint.strip().isdecimal() for joint in joints):
-            raise InputError(f"--coupled has {pair!r:.40}; expected pairs of joints such as 2:3")
-        first, second = sorted(int(joint) - 1 for joint in joints)
+        try:
+            first, second = sorted(int(joint) - 1 for joint in pair.split(":"))
+        except ValueError:
+            raise InputError(f"--coupled has {pair!r:.40}; expected pairs of joints such as 2:3") from None
         pairs.append((first, second))
     try:
         require_motors(rows, pairs, d)
@@ -266,7 +268,7 @@ def stated_motors(options: Arguments, d: int) -> tuple[Rows | None, tuple[Pair, 
     return rows, tuple(pairs)
 
 
-def motion_lines(by: str, fit: MotionFit | None, times: dict[str, float]) -> list[str]:
+def motion_lines(by: str, fit: MotionFit | None, times: dict[str, float | int]) -> list[str]:
     """Lines on the fit to motions, if there is one, and on predictions of held-out motions."""
     line = (
         f"held-out motions: predicted for {times['vpt_seconds']:.3g} s of {times['predicted_seconds']:.3g} s, by "
@@ -289,39 +291,8 @@ def predictor(model: Model) -> Predict:
         motion = dynamics(model.energies(parameters))
         return motion.inverse_dynamics(q, qd, qdd), motion.friction(q, qd)
 
-    every = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
-
-    def predict(parameters: Parameters, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
-        torque, friction = every(parameters, data.q, data.qd, data.qdd)
-        return np.asarray(torque), np.asarray(friction)
-
-    return predict
-
-
-def friction_figure(
-    predict: Predict,
-    parameters: Parameters,
-    test: Trajectories,
-    torque: np.ndarray,
-    friction: np.ndarray,
-    names: tuple[str, ...],
-    units: list[str],
-) -> Callable[[Path], None]:
-    """Figure of friction over rates: the identified curves, and what the rest of the model leaves of the torques.
-
-    All joints are evaluated at once, each over its own range: friction in a joint does not depend on the others.
-    """
-    rates = np.linspace(test.qd.min(axis=0), test.qd.max(axis=0), len(test.t))
-    still = np.zeros_like(rates)
-    curves = predict(parameters, test._replace(q=still, qd=rates, qdd=still))[1]
-    return png(
-        friction_curves,
-        {"identified": (rates, curves)},
-        names=names,
-        force_unit=units,
-        measured=(test.qd, test.tau - (torque - friction)),
-        rate_unit=["rad/s" if unit == "N m" else "m/s" for unit in units],
-    )
+    every = compiled(jax.vmap(one, in_axes=(None, 0, 0, 0)))
+    return lambda parameters, data: jax.tree.map(np.asarray, every(parameters, data.q, data.qd, data.qdd))
 
 
 def shape_lines(description: Description) -> list[str]:

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from dln_jax.data.encoders.sampling import torque_noise
+from dln_jax.data.log import Log
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import every
 from dln_jax.identification.identify import Identification, parameters_of
@@ -47,10 +49,8 @@ def judge_robot(
     train: Trajectories,
     test: Trajectories,
     torques: dict[str, np.ndarray],
-    names: tuple[str, ...],
+    log: Log,
     *,
-    noise: np.ndarray | None,
-    causes: tuple[str, ...],
     robust: bool,
     whole: bool,
 ) -> tuple[Verdict, dict[str, float | int]]:
@@ -59,12 +59,13 @@ def judge_robot(
     Args:
         known: parameters in the robot's file.
         torques: torques on the held-out motions [N, d], by "file", "least_squares" and "identified".
-        noise: standard deviation of the torques' noise [d].
-        causes: faults of the log that no filter repairs.
+        log: the log with its robot; its faults count, and the noise of its torques is estimated if it states none.
         robust: whether spikes in held-out samples are ignored.
         whole: whether a fit to motions predicts the held-out ones to their ends.
     """
-    fitted, d = torques["identified"], test.degrees_of_freedom
+    assert log.robot is not None
+    names, fitted, d = log.robot.tree.names, torques["identified"], test.degrees_of_freedom
+    noise = torque_noise(train) if log.torque_noise is None else log.torque_noise
     rows = ~spikes(test.tau).any(axis=1) if robust else np.ones(len(test.t), bool)
     errors = held_out(fitted[rows], test.tau[rows], noise=noise, file=torques["file"][rows])
     by_torques = judge(errors, names)
@@ -82,7 +83,7 @@ def judge_robot(
         consistent_verdict(solution, fitted, torques["least_squares"], test.tau),
         friction_verdict(names, test.qd, test.tau, friction, None if stated else np.array(scales)),
         weight_verdict(*bodies),
-        causes=causes,
+        causes=log.faults,
     )
     if verdict.level != "good" and description["motors"] is None:
         thin = every(train, -(-len(train.t) // MOST))
