@@ -120,23 +120,20 @@ def class_of(stated: Mapping[str, Any]) -> type:
     return CLASSES.get(str(model), NetworkOptions)
 
 
-VARIANTS = Variants(
-    class_of,
-    {
-        NetworkOptions: "networks, such as --model structured-delan",
-        TrigonometricOptions: "--model trigonometric",
-        KernelOptions: "--model trigonometric-kernel",
-        AutomaticOptions: "--model auto",
-        TreeOptions: "--model learned-tree",
-    },
-)
-
-
 @dataclass(frozen=True)
 class Arguments(Plant):
     """What to train on, how, and where the results go; `VARIANTS` says which options a model has."""
 
-    VARIANTS: ClassVar = VARIANTS
+    VARIANTS: ClassVar = Variants(
+        class_of,
+        {
+            NetworkOptions: "networks, such as --model structured-delan",
+            TrigonometricOptions: "--model trigonometric",
+            KernelOptions: "--model trigonometric-kernel",
+            AutomaticOptions: "--model auto",
+            TreeOptions: "--model learned-tree",
+        },
+    )
     model: Unstated[ModelName] = None
 
 
@@ -166,7 +163,7 @@ def train(options: Options, command: str) -> None:
     from dln_jax.time_limit import deadline
     from dln_jax.types import require_positive
 
-    seconds = getattr(options, "seconds", None)
+    seconds = options.seconds if isinstance(options, Limited) else None
     if seconds is not None:
         require_positive(seconds=seconds)
     until, mesh = deadline(seconds), mesh_of(options) if isinstance(options, Devices) else None
@@ -187,7 +184,7 @@ def train(options: Options, command: str) -> None:
             fit = with_uncertainty(fit, parts, log.torque, print)
             fit.save(folder)
         report = evaluate(fit, parts, log, mesh=mesh)
-        limited = seconds is not None or getattr(options, "steps", None) is not None
+        limited = seconds is not None or (isinstance(options, Network) and options.steps is not None)
         if report.error:
             report = report._replace(error=report.error.replace("the model", str(folder), 1))
         finish(folder, options, report._replace(ended_by_user=fit.optimiser is not None and limited))

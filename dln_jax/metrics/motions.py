@@ -32,6 +32,7 @@ from dln_jax.mechanics.discrete import Torque, driven, torque_slopes
 from dln_jax.mechanics.dynamics import Dynamics, InverseForward, PlainDynamics
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.integrators import looped_rk4
+from dln_jax.metrics.phase_space import finite_or_infinite
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, Vector, require_positive
 
@@ -242,7 +243,7 @@ def predict_measured(
         raise InputError(f"fitted is {fitted}; expected 2 samples or more, and fewer than the {segments.t.shape[1]}")
     spread = segments.q.reshape(-1, segments.q.shape[2]).std(axis=0)
     scale = jnp.asarray(np.where(spread > 0, spread, 1.0))
-    measured = MeasuredWindows(*map(jnp.asarray, segments))
+    measured = tuple(map(jnp.asarray, segments))
     return Predictions(*map(np.asarray, _predict(model, parameters, measured, scale, fitted, substeps, momenta)))
 
 
@@ -305,7 +306,7 @@ def normalised_state_error(data: Trajectories, motions: list[Motion]) -> float:
         predicted, true = np.concatenate([getattr(motion, key) for motion in motions]), getattr(data, key)
         with np.errstate(over="ignore", invalid="ignore"):
             errors.append((predicted - true[samples]) ** 2 / _variance(true, key))
-    return float(np.sqrt(_mean_or_infinity(np.concatenate(errors, axis=1))))
+    return float(np.sqrt(finite_or_infinite(np.mean(np.concatenate(errors, axis=1)))))
 
 
 def metrics_of_motions(motions: Motion, energies: Array | None, data: Trajectories) -> dict[str, float]:
@@ -329,7 +330,7 @@ def metrics_of_motions(motions: Motion, energies: Array | None, data: Trajectori
     if energies is not None:
         pairs = zip(np.asarray(energies, np.float64)[1], (motion.work for motion in interpolated), strict=True)
         imbalances = [abs(energy[: len(work)] - energy[0] - work) for energy, work in pairs]
-        metrics["energy_error_j"] = _mean_or_infinity(np.concatenate(imbalances))
+        metrics["energy_error_j"] = float(finite_or_infinite(np.mean(np.concatenate(imbalances))))
     return metrics
 
 
@@ -359,7 +360,7 @@ def prediction_metrics(
 
 # Compiled once per model and shape, for all parameters and motions.
 @functools.partial(jax.jit, static_argnames=("model", "fitted", "substeps", "momenta"))
-def _predict(model: Model, parameters, segments: MeasuredWindows, scale, fitted: int, substeps: int, momenta: bool):
+def _predict(model: Model, parameters, segments: tuple[Array, ...], scale, fitted: int, substeps: int, momenta: bool):
     energies, d = model.energies(parameters), len(scale)
 
     def states_and_work(start, t, tau):
@@ -409,8 +410,3 @@ def _variance(values: np.ndarray, key: str) -> np.ndarray:
         column = int(np.argmin(variance > 0))
         raise InputError(f"{key}[:, {column}] is the same in all samples; errors cannot be measured in its variance")
     return variance
-
-
-def _mean_or_infinity(errors: np.ndarray) -> float:
-    mean = float(np.mean(errors))
-    return mean if np.isfinite(mean) else float("inf")

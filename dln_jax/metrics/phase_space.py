@@ -77,7 +77,7 @@ def energies(H: Hamiltonian, motions: Motions) -> Float[np.ndarray, "K T"]:
     return finite_or_infinite(np.asarray(_along(H, jnp.asarray(motions.q), jnp.asarray(motions.p))))
 
 
-def finite_or_infinite(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+def finite_or_infinite(values: np.ndarray | np.floating) -> np.ndarray:
     """Replaces values that are not finite by infinity, so that a NaN never counts as a small error."""
     return np.where(np.isfinite(values), values, np.inf)
 

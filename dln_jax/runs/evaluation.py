@@ -104,11 +104,8 @@ def evaluate(
     """
     test, training = parts.sets.test, fit.training
     # The test samples are followed by the validation samples, so that one program predicts both.
-    keys = [key for key in ("q", "qd", "qdd", "tau", "p", "pd") if getattr(test, key) is not None]
-    both = test._replace(
-        **{key: np.concatenate([getattr(part, key) for part in (test, parts.sets.validation)]) for key in keys}
-    )
-    samples = samples_of(both, fit.dtype)
+    both = (samples_of(part, fit.dtype) for part in (test, parts.sets.validation))
+    samples = jax.tree.map(lambda *arrays: np.concatenate(arrays), *both)
     predict = compiled(prediction_program(fit.model.energies, mesh=mesh))
     answers = as_arrays(predict(fit.parameters, samples))
     predicted = {name: array[: len(test.t)] for name, array in answers.items()}
@@ -304,16 +301,15 @@ def bands(model: Model, parameters: Any, uncertainty: Uncertainty, data: Traject
     Args:
         model: the model in float64.
     """
-    std, flags, first = [], [], 0
+    answers, first = [], 0
     with jax.enable_x64(True):
         parameters = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), parameters)
         for rows, *_ in design_chunks(design(model), parameters, data, CHUNK, even=False):
             part = slice(first, first + len(rows))
-            deviations, out = _bands(uncertainty, rows, (data.q[part], data.qd[part], data.qdd[part]))
-            std.append(deviations)
-            flags.append(out)
+            answers.append(_bands(uncertainty, rows, (data.q[part], data.qd[part], data.qdd[part])))
             first = part.stop
-    return np.concatenate(std), np.concatenate(flags)
+    std, flags = map(np.concatenate, zip(*answers, strict=True))
+    return std, flags
 
 
 @jax.jit

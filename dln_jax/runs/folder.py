@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
+from jax.experimental import multihost_utils
 
 from dln_jax.errors import InputError
 from dln_jax.files import PARTIAL, as_type, is_file, is_folder, read_json, write_json
 from dln_jax.runs.arguments import arguments_for
-from dln_jax.runs.scaled import copied_folder, is_first, wait_for_all
+from dln_jax.runs.options import Scaled
+from dln_jax.runs.scaled import copied_folder
 
 CONFIG = "config.json"
 """File in a run folder with the arguments that the run was started with."""
@@ -136,16 +138,17 @@ def _checked(path: Path, values: Mapping[str, Any], arguments: type) -> Any:
 @contextlib.contextmanager
 def command_folder(options: Any, command: str) -> Iterator[Path]:
     """Yields the run folder of a command. config.json gets the arguments."""
-    resume = getattr(options, "resume", False)
+    out, resume = options.out, getattr(options, "resume", False)
+    processes, number = (options.processes or 1, options.process_id) if isinstance(options, Scaled) else (1, None)
     folder_of_run = (
-        run_folder(options.out, command, resume=resume, resumable=hasattr(options, "resume"))
-        if is_first(options)
-        else copied_folder(options, resume)
+        copied_folder(options, resume)
+        if number
+        else run_folder(out, command, resume=resume, resumable=hasattr(options, "resume"))
     )
     with folder_of_run as folder:
-        if resume:
-            wait_for_all(options)
-        else:
+        if resume and processes > 1:
+            multihost_utils.sync_global_devices("all are here")
+        elif not resume:
             write_config(folder, options)
         yield folder
 

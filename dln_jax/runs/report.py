@@ -79,8 +79,8 @@ def finish(folder: Path, options: Any, report: Report) -> None:
 def print_numbers(
     rows: Iterable[Sequence[str]],
     *,
-    title: str | None = None,
-    columns: Sequence[str] = ("quantity", "value", "unit"),
+    title: str,
+    columns: Sequence[str],
     width: int | None = None,
 ) -> None:
     """Prints a table of quantities, their values and units, `width` columns wide (default: the terminal's)."""

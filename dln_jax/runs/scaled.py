@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import jax
-from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
 from dln_jax.files import PARTIAL
@@ -97,17 +96,6 @@ def end_at_once(code: int) -> NoReturn:
         with contextlib.suppress(OSError):
             stream.flush()
     os._exit(code)
-
-
-def is_first(options: Any) -> bool:
-    """Whether this process writes the results."""
-    return not getattr(options, "process_id", None)
-
-
-def wait_for_all(options: Any) -> None:
-    """Waits until all processes have reached this call."""
-    if (getattr(options, "processes", None) or 1) > 1:
-        multihost_utils.sync_global_devices("all are here")
 
 
 @contextlib.contextmanager

@@ -73,14 +73,13 @@ def assembled(functions: tuple[Callable[..., Any], ...], keywords: Mapping[str, 
     return first(lambda needs: assembled(tuple(rest), {**keywords, "needs": needs}), **own)
 
 
-def friction_laws(make: Callable[[Needs], Model], needs: Needs, *, dtype: DTypeLike = jnp.float32) -> Model:
-    """Adds the friction laws that the needs name."""
-    return with_joint_friction(make(needs._replace(joint_friction=())), needs, linear=False, dtype=dtype)
+def friction_laws(*, linear: bool) -> Callable[..., Model]:
+    """The addition of the friction laws that the needs name, to a model that is `linear` in its parameters or not."""
 
+    def add(make: Callable[[Needs], Model], needs: Needs, *, dtype: DTypeLike = jnp.float32) -> Model:
+        return with_joint_friction(make(needs._replace(joint_friction=())), needs, linear=linear, dtype=dtype)
 
-def linear_friction_laws(make: Callable[[Needs], Model], needs: Needs, *, dtype: DTypeLike = jnp.float32) -> Model:
-    """Adds the friction laws that the needs name to a model that is linear in its parameters."""
-    return with_joint_friction(make(needs._replace(joint_friction=())), needs, linear=True, dtype=dtype)
+    return add
 
 
 @functools.wraps(make_residual)
@@ -105,8 +104,8 @@ _shared = [parameter for name, parameter in _rigid.items() if name not in ("tree
 make_stored_tree.__signature__ = inspect.Signature([_own["needs"], _own["tree"], *_shared])  # type: ignore
 
 MOMENTUM = {"momentum_scale": ("p",)}
-LAWS, LINEAR = (friction_laws,), (linear_friction_laws,)
-NETWORK = (friction_laws, make_dissipative)
+LAWS, LINEAR = (friction_laws(linear=False),), (friction_laws(linear=True),)
+NETWORK = (*LAWS, make_dissipative)
 RATES = {"rate_scale": ("qd",), "acceleration_scale": ("qdd",), "tau_scale": ("tau",)}
 CATALOGUE = {
     "structured-delan": Entry(make_delan, Properties(definite=True), additions=LAWS),

@@ -81,14 +81,14 @@ def save_tree(directory: Path, name: str, tree: Any, facts: dict[str, Any], *, n
                 old.unlink()
 
 
-def require_fitting(tree: Any, like: Any) -> None:
-    """Raises `InputError` unless a tree has real arrays with the names, shapes and dtypes of another."""
+def require_fitting(tree: Any, like: Any, *, kinds: str = "fiu") -> None:
+    """Raises `InputError` unless a tree has arrays of these kinds, with the names, shapes and dtypes of another."""
     own, expected = _flatten(tree), _flatten(like)
     if different := sorted(set(own) ^ set(expected)):
         state = "unknown" if different[0] in own else "missing"
         raise InputError(f"the parameters are those of another model: '{different[0]:.80}' is {state}")
     for key, array in expected.items():
-        if not isinstance(own[key], np.ndarray | jax.Array | np.generic) or own[key].dtype.kind not in "fiu":
+        if not isinstance(own[key], np.ndarray | jax.Array | np.generic) or own[key].dtype.kind not in kinds:
             raise InputError(f"parameter '{key}' is {reprlib.repr(own[key])}; expected an array of real numbers")
         shape, dtype = np.shape(own[key]), own[key].dtype
         if shape != array.shape or dtype != array.dtype:
@@ -130,18 +130,12 @@ def load_tree(directory: Path, name: str, like: Any) -> Any:
         tensors = safetensors.numpy.load(data)
     except Exception as error:  # the decoder's own errors, and NumPy's for unknown types
         raise InputError(f"{path}: not a safetensors file ({error}); restore it or train again") from error
-    expected = _flatten(like)
-    for key, array in expected.items():
-        if key not in tensors:
-            raise InputError(f"{path}: has no tensor '{key}'; the settings differ from those it was written with")
-        stored = tensors[key]
-        if stored.shape != array.shape or stored.dtype != array.dtype:
-            raise InputError(
-                f"{path}: '{key}' is {stored.dtype} {stored.shape}, expected {array.dtype} {array.shape}; "
-                "load it with the settings and precision it was written with"
-            )
+    try:
+        require_fitting(tensors, like, kinds="fiub")
+    except InputError as error:
+        raise InputError(f"{path}: {error}; load it with the settings and precision it was written with") from None
     # Copies, because arrays that share the file's bytes could not be donated.
-    leaves = [jax.numpy.array(tensors[key]) for key in expected]
+    leaves = [jax.numpy.array(tensors[key]) for key in _flatten(like)]
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 

@@ -16,7 +16,6 @@ from dln_jax.identification.shared_motors import MOST, shared_motor
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.metrics.verdict import WORSE, Verdict, held_out, judge, verdict_metrics, worst
 from dln_jax.models.model import Parameters
-from dln_jax.models.trees import RigidTreeParameters
 from dln_jax.zoo.descriptions import Description
 
 HEAVIER, MUCH_HEAVIER = 5.0, 50.0
@@ -77,7 +76,8 @@ def judge_robot(
     friction = predict(mine, test._replace(q=still, qdd=still))[1]
     scales = description["velocity_scale"]
     stated = not isinstance(scales, list) or not {"coulomb", "stribeck"} & set(description["needs"]["joint_friction"])
-    bodies = [predict(without_joints(theta), test)[0] for theta in (mine, known)]
+    alone = (jax.tree.map(jnp.zeros_like, theta)._replace(inertias=theta.inertias) for theta in (mine, known))
+    bodies = [predict(theta, test)[0] for theta in alone]
     verdict = worst(
         by_torques,
         consistent_verdict(solution, fitted, torques["least_squares"], test.tau),
@@ -148,11 +148,6 @@ def friction_verdict(
             reason = f"{names[k]} hardly reaches {scales[k]:.3g}/s, the velocity scale of its dry friction"
             every.append(Verdict("doubtful", reason, "state it (--velocity-scale 0.05), or record faster motions"))
     return worst(*every)
-
-
-def without_joints(parameters: RigidTreeParameters) -> RigidTreeParameters:
-    """Parameters of the bodies alone, without armature and friction."""
-    return jax.tree.map(jnp.zeros_like, parameters)._replace(inertias=parameters.inertias)
 
 
 def weight_verdict(mine: Float[np.ndarray, "N d"], file: Float[np.ndarray, "N d"]) -> Verdict:
