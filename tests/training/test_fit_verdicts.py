@@ -12,7 +12,7 @@ from dln_jax.learning.fit import Fit
 from dln_jax.learning.objectives import CANONICAL, STATED
 from dln_jax.metrics.motions import Motion
 from dln_jax.models.model import Model
-from dln_jax.runs.evaluation import verdict_of as verdict_and_metrics
+from dln_jax.runs.verdict import verdict_of as verdict_and_metrics
 
 N = 300
 OBJECTIVES = {**STATED, "momenta": CANONICAL}

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import jax
 import numpy as np
@@ -12,6 +12,7 @@ from jax import Array
 from dln_jax.commands.identification.motions import (
     choose_window,
     lightly_filtered,
+    motion_lines,
     prediction_times,
     refit,
     spread_of,
@@ -26,7 +27,6 @@ from dln_jax.data.splits import Split, is_cut
 from dln_jax.figures.torques import friction_curves, torque_by_joint
 from dln_jax.files import write_bytes, write_json
 from dln_jax.identification.identify import identify, parameters_of
-from dln_jax.identification.motions import MotionFit
 from dln_jax.identification.report import base_rows, findings, parameter_rows, summary, text
 from dln_jax.identification.residual import inner_split
 from dln_jax.identification.rigid_tree import at_reference, build_rigid_tree, describe_rigid_tree
@@ -35,7 +35,7 @@ from dln_jax.learning.friction import reference_temperature
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction.laws import require_laws, shape_of
 from dln_jax.mechanics.trees.motors import Pair, armature_matrix, require_motors
-from dln_jax.metrics.errors import normalised_error
+from dln_jax.metrics.errors import mean_square, normalised_error
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.trees import RigidTreeParameters, Rows, pairs_of
 from dln_jax.runs.arguments import (
@@ -144,7 +144,7 @@ def run(options: Arguments) -> None:
         }
         for name, error in errors.items():
             prefix = "" if name == FITTED else f"{name}_"
-            metrics[f"{prefix}torque_mse"] = float(np.mean(np.sum((torques[name] - test.tau) ** 2, axis=1)))
+            metrics[f"{prefix}torque_mse"] = mean_square(torques[name] - test.tau)
             metrics[f"{prefix}nmse"] = float(np.nanmean(error))
             metrics |= {f"{prefix}nmse_joint_{k + 1}": float(value) for k, value in enumerate(error)}
         metrics |= {f"noise_joint_{k + 1}": float(value) for k, value in enumerate(solution.fit.noise)}
@@ -268,22 +268,6 @@ def stated_motors(options: Arguments, d: int) -> tuple[Rows | None, tuple[Pair, 
     return rows, tuple(pairs)
 
 
-def motion_lines(by: str, fit: MotionFit | None, times: dict[str, float | int]) -> list[str]:
-    """Lines on the fit to motions, if there is one, and on predictions of held-out motions."""
-    line = (
-        f"held-out motions: predicted for {times['vpt_seconds']:.3g} s of {times['predicted_seconds']:.3g} s, by "
-        f"torques alone for {times['by_torques_vpt_seconds']:.3g} s (mean valid prediction time)"
-    )
-    if fit is None:
-        return [line]
-    lines = [
-        f"by {by}: windows are off by {fit.after:.3g} of their noise (before: {fit.before:.3g}; {fit.rounds} rounds)",
-        line,
-        f"motions follow the logged torques by {1e3 * fit.delay:.1f} ms; the model has no delay",
-    ]
-    return lines if fit.converged else [*lines, "the fit to motions did not converge; record motions closer to the use"]
-
-
 def predictor(model: Model) -> Predict:
     """(parameters, data) -> torque, and friction, which is a part of it, [N, d] each; compiled once per N."""
 
@@ -314,20 +298,24 @@ def write_identified(
     armature = armature_matrix(parameters.armature, motors, pairs_of(parameters.coupling))
     tree = robot.tree._replace(inertias=np.asarray(parameters.inertias), armature=np.asarray(armature))
     remarks = [f"Identified from {options.data.name}."]
-    coefficients = {
-        name: np.asarray(values)
-        for name, values in parameters._asdict().items()
-        if values is not None and name not in ("inertias", "armature", "coupling")
-    }
-    friction: dict[str, Any] = {"damping": coefficients.pop("viscous", None)}
-    friction["coulomb"] = coefficients.pop("coulomb", None)
+    named = parameters.friction._asdict().items()
+    coefficients = {name: np.asarray(values) for name, values in named if values is not None}
+    damping, coulomb = (coefficients.pop(name, None) for name in ("viscous", "coulomb"))
     for name, values in coefficients.items():
         pairs = ", ".join(f"{joint} {value!r}" for joint, value in zip(tree.names, values.tolist(), strict=True))
         remarks.append(f"Friction that the file cannot state, {name}: {pairs}.")
     remarks += [f"Not in this file: {line}." for line in shape_lines(description) if line.startswith(("load", "cool"))]
-    locked = names_listed(options.lock)
     try:
-        write_robot(path, options.robot, tree, **friction, motors=motors, lock=locked, remarks=tuple(remarks))
+        write_robot(
+            path,
+            options.robot,
+            tree,
+            damping=damping,
+            coulomb=coulomb,
+            motors=motors,
+            lock=names_listed(options.lock),
+            remarks=tuple(remarks),
+        )
     except InputError as error:
         return f"no {path.name}: {error}"
     lacks = " without armature, which URDF cannot state (a comment in the file has it)" * (path.suffix == ".urdf")
