@@ -5,7 +5,7 @@ import itertools
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from types import NoneType
-from typing import Annotated, Any, NamedTuple, TypeVar, get_args
+from typing import Annotated, Any, NamedTuple, get_args
 
 import tyro
 from tyro._errors import BadValue, InstantiationFailure, InvalidChoice, ParseErrorEvent, on_parse_error
@@ -13,8 +13,6 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 
 from dln_jax.errors import InputError
 from dln_jax.sizes import require_magnitude
-
-Arguments = TypeVar("Arguments")
 
 _rules = ConstructorRegistry()
 

@@ -110,7 +110,6 @@ def evaluate(
     figures = figures_of(fit, parts, log, motions, predicted)
     of_bands, of_figures = bands_of(fit, test, predicted["tau"])
     figures |= of_figures
-    validation = np.ravel(training.validation)
     metrics = {
         **errors(predicted, test),
         "gravity_determined": int(not fit.summed(parts)),
@@ -118,7 +117,7 @@ def evaluate(
         **spread,
         **of_bands,
         **of_rollouts,
-        **({"validation_error": float(validation[fit.best])} if training.history else {}),
+        **({"validation_error": float(np.ravel(training.validation)[fit.best])} if training.history else {}),
         **cost_metrics(
             training,
             latency_of(fit, test),

@@ -39,7 +39,7 @@ REMEDY = "restore the file, or train again into another folder"
 
 def write_config(folder: Path, options: Any, **chosen: Any) -> None:
     """Writes config.json: the arguments of a run, the values `chosen` from them, and digests of the input files."""
-    files = fingerprints(stored_files(options))
+    files = {key: fingerprint(path) for key, path in stored_files(options).items()}
     more = {CHOSEN: chosen} if chosen else {}
     write_json(folder / CONFIG, {**stored_arguments(options), **more, **({FILES: files} if files else {})})
 
@@ -57,18 +57,13 @@ def stored_files(options: Any) -> dict[str, Path]:
     return {key: path for key, path in paths.items() if is_file(path) or is_folder(path)}
 
 
-def fingerprints(files: Mapping[str, Path]) -> dict[str, str]:
-    """SHA-256 digests of files and folders; a resumed run recognises its data by them, even if they have moved."""
-
-    def of_file(path: Path) -> str:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-
-    def of_folder(path: Path) -> str:
+def fingerprint(path: Path) -> str:
+    """SHA-256 digest of a file or folder; a resumed run recognises its data by it, even if they have moved."""
+    if is_folder(path):
         inside = sorted((part.relative_to(path).as_posix(), part) for part in path.rglob("*") if is_file(part))
-        return hashlib.sha256("\n".join(f"{of_file(part)} {name}" for name, part in inside).encode()).hexdigest()
-
-    return {name: of_folder(path) if is_folder(path) else of_file(path) for name, path in files.items()}
+        return hashlib.sha256("\n".join(f"{fingerprint(part)} {name}" for name, part in inside).encode()).hexdigest()
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def with_stored_arguments(typed: Any, arguments: type) -> Any:
@@ -95,7 +90,7 @@ def with_stored_arguments(typed: Any, arguments: type) -> Any:
         path, option = moved or Path(str(values.get(key))), f"--{key.replace('_', '-')}"
         if not (is_file(path) or is_folder(path)):
             raise InputError(f"the run in {folder} reads {path}, which is not here; give its new path by {option}")
-        if fingerprints({key: path})[key] != digest:
+        if fingerprint(path) != digest:
             raise InputError(
                 f"the run in {folder} was started with other data than {path} has now (SHA-256); give the file it was "
                 f"started with by {option}"

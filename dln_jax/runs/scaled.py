@@ -14,15 +14,12 @@ import jax
 from jax.sharding import Mesh
 
 from dln_jax.files import PARTIAL
-from dln_jax.runs.options import Scaled
+from dln_jax.runs.options import Drawn, Scaled
 from dln_jax.scale import processes
 from dln_jax.scale.devices import backend_started
 from dln_jax.scale.mesh import batch_mesh
 from dln_jax.scale.processes import Membership
 from dln_jax.types import InputError
-
-SEEN_BY_USERS = ("figures",)
-"""Options for output that only the first process produces."""
 
 
 def mesh_of(options: Any) -> Mesh | None:
@@ -60,7 +57,7 @@ def joined(member: Membership, options: Any, *, seconds: int = processes.JOINING
     """
     if backend_started():
         raise InputError("JAX has been used in this process; several are started before it is")
-    own = {"processes", "coordinator", "process_id", "out", *SEEN_BY_USERS}
+    own = {"processes", "coordinator", "process_id", "out", "figures"}
     shared = {
         f"--{key.replace('_', '-')}": str(value) if isinstance(value, Path) else value
         for key, value in dataclasses.asdict(options).items()
@@ -79,7 +76,7 @@ def joined(member: Membership, options: Any, *, seconds: int = processes.JOINING
     here: dict[str, Any] = {"processes": jax.process_count(), "process_id": jax.process_index()}
     if jax.process_index():
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115  open until the process ends
-        here |= {name: False for name in SEEN_BY_USERS if hasattr(options, name)}
+        here |= {"figures": False} if isinstance(options, Drawn) else {}
     return dataclasses.replace(options, **here)
 
 

@@ -7,7 +7,6 @@ A name is the same on command lines, in files, in tables and beside published nu
 import functools
 import inspect
 from collections.abc import Callable, Mapping
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -57,7 +56,7 @@ class Entry(NamedTuple):
     factory: Callable[..., Any]
     """Makes the model from keywords, including `needs` and `dtype` if it takes them."""
     properties: Properties
-    sizes: Mapping[str, tuple[str, ...]] = MappingProxyType({})
+    sizes: Mapping[str, tuple[str, ...]] = {}
     """Keywords that are typical sizes, and the arrays of `Trajectories` whose standard deviation sets each."""
     additions: tuple[Callable[..., Model], ...] = ()
     """Terms that are added to the factory's model, the last one first. Each is a function of `make`, which makes the

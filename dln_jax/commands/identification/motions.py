@@ -126,15 +126,14 @@ def choose_window(
         rest = np.delete(present, slice(fold, None, FOLDS))
         inner, moved, held = select(train, rest), select(motions, rest), select(motions, present[fold::FOLDS])
         solution = identify(model, known, inner, **options)
-        thetas: dict[float | None, np.ndarray] = {None: solution.theta}
-        for window in [window for window in WINDOWS if window in times]:
+        for window in list(times):
             try:
-                thetas[window] = refit(by, model, known, solution, inner, moved, window, reweightings=0)[0].theta
+                theta = refit(by, model, known, solution, inner, moved, window, reweightings=0)[0].theta
             except InputError as error:
                 del times[window]
                 reason = f"; other lengths were left out: {error}"
-        for window, theta in thetas.items():
-            times[window].append(prediction_times(model, parameters_of(theta, known), held, variance)[0])
+            else:
+                times[window].append(prediction_times(model, parameters_of(theta, known), held, variance)[0])
     means = {window: float(np.mean(np.concatenate(parts))) for window, parts in times.items()}
     best = max(means, key=lambda window: means[window])
     names = {window: "torques" if window is None else f"{window:g} s" for window in means}

@@ -83,10 +83,9 @@ def run(options: Arguments) -> None:
     train, test = parts.sets.train, parts.sets.test
     logs = [train, test]
     if options.by != "torques" and log.measured is not None:
-        light = split_log(
-            log._replace(data=lightly_filtered(log.measured, log.smoothed)), options.test, validation=False
-        ).sets
-        logs += [light.train, light.test]
+        light = log._replace(data=lightly_filtered(log.measured, log.smoothed))
+        lighter = split_log(light, options.test, validation=False).sets
+        logs += [lighter.train, lighter.test]
 
     with command_folder(options, "identify") as folder:
         whole_blocks = parts.blocks and not is_cut(options.test)
@@ -252,9 +251,7 @@ def stated_motors(options: Arguments, d: int) -> tuple[Rows | None, tuple[Pair, 
     if options.motors is not None:
         rows = tuple(numbers_of("--motors", row, [d]) for row in options.motors.split(";"))
         if len(rows) != d:
-            raise InputError(
-                f"--motors has {len(rows)} rows; expected {d}, one for each motor, separated by semicolons"
-            )
+            raise InputError(f"--motors has {len(rows)} rows; expected {d}, one per motor, separated by semicolons")
     for pair in names_listed(options.coupled):
         try:
             first, second = sorted(int(joint) - 1 for joint in pair.split(":"))
