@@ -194,8 +194,7 @@ def read(options: Options) -> Any:
     """The log that the options name, and its test."""
     from dln_jax.data.log import log_of, read_log
     from dln_jax.data.robots import read_robot
-    from dln_jax.runs.arguments import names_listed, refuse_given
-    from dln_jax.runs.logs import cutoff, facts, needs_of
+    from dln_jax.runs.arguments import cutoff, facts, names_listed, needs_of, refuse_given
     from dln_jax.scenes.datasets.generators import CHARACTERS_TEST, default_data
     from dln_jax.scenes.pendulums import two_link_arm
     from dln_jax.scenes.registry import scene_named

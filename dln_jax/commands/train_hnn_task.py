@@ -239,8 +239,7 @@ def main(options: Options) -> None:
 def read(options: Options) -> "PhaseLog":
     """The motions of the task."""
     from dln_jax.commands.phase_spaces.data import generate, read_motions
-    from dln_jax.runs.arguments import numbers_of
-    from dln_jax.runs.logs import facts, needs_of
+    from dln_jax.runs.arguments import facts, needs_of, numbers_of
 
     if not isinstance(options, Recorded):
         return generate(options.task, options.trajectories)

@@ -5,14 +5,18 @@ import itertools
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from types import NoneType
-from typing import Annotated, Any, NamedTuple, get_args
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args
 
 import tyro
 from tyro._errors import BadValue, InstantiationFailure, InvalidChoice, ParseErrorEvent, on_parse_error
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from dln_jax.errors import InputError
+from dln_jax.runs.options import Checked, Filtered, Logged
 from dln_jax.sizes import require_magnitude
+
+if TYPE_CHECKING:
+    from dln_jax.types import Needs
 
 _rules = ConstructorRegistry()
 
@@ -216,3 +220,48 @@ def numbers_of(option: str, text: str, counts: Collection[int] = (), *, positive
     for number in numbers:
         require_magnitude(option, number)
     return numbers
+
+
+def facts(options: Logged) -> dict[str, Any]:
+    """Keywords of `data.log.read_log`: facts on a file, and how to filter and check it."""
+    names = {"joints": names_listed(options.joints), "topics": names_listed(options.topics)}
+    factor = None if options.torque_factor is None else torque_factor(options.torque_factor)
+    stated = {"rate": options.rate, "units": options.units, "torque_factor": factor, **names}
+    if isinstance(options, Checked):
+        stated["accept_log"] = options.accept_log
+    if isinstance(options, Filtered):
+        stated["cutoff"] = cutoff(options.cutoff)
+    return stated
+
+
+def torque_factor(text: str) -> float | tuple[float, ...] | dict[str, float]:
+    """Parses --torque-factor: a number, one for each joint, or NAME=NUMBER."""
+    option = "--torque-factor"
+    if "=" in text:
+        pairs = pairs_of(option, text.split(","))
+        return {name: numbers_of(f"{option} {name}", factor, [1])[0] for name, factor in pairs.items()}
+    numbers = numbers_of(option, text)
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+def cutoff(text: str | None) -> Any:
+    """Parses --cutoff: Hz, auto, or inf."""
+    if text in (None, "auto"):
+        return text
+    try:
+        value = float(str(text))
+    except ValueError:
+        value = -1.0
+    if not value > 0:
+        raise InputError(f"--cutoff is {text!r:.40}; expected Hz, a positive number, or auto (inf: no filter)")
+    return value
+
+
+def needs_of(text: str | None) -> "Needs | None":
+    """Parses --needs; `InputError` if the text does not state valid needs."""
+    from dln_jax.data.stated_needs import needs_from_text  # imports JAX
+
+    try:
+        return None if text is None else needs_from_text(text)
+    except InputError as error:
+        raise InputError(f"--{error}; see --help for an example") from None

@@ -165,18 +165,20 @@ def run_folder(out: Path | None, default: str, *, resume: bool = False, resumabl
         KeyboardInterrupt: with the folder as its argument, so that the handler can report where the run is.
     """
     if resume and out is not None:
-        with locked(out), _naming_itself(out):
-            yield out
-        return
-    folder, created = _next_number(Path("runs"), default) if out is None else (out, _create(out))
-    _require_free(folder, resumable)  # before locking, and again below once no other process can write
+        folder, created = out, None
+    else:
+        folder, created = _next_number(Path("runs"), default) if out is None else (out, _create(out))
+        _require_free(folder, resumable)  # before locking, and again below once no other process can write
     with locked(folder):
-        _require_free(folder, resumable)
+        if created is not None:
+            _require_free(folder, resumable)
         try:
-            with _naming_itself(folder):
-                yield folder
+            yield folder
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(folder) from stop
         except InputError:
-            _withdraw(folder, created)
+            if created is not None:
+                _withdraw(folder, created)
             raise
 
 
@@ -208,14 +210,6 @@ def locked(folder: Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
-
-
-@contextlib.contextmanager
-def _naming_itself(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt(folder) from stop
 
 
 def _next_number(parent: Path, name: str) -> tuple[Path, list[Path]]:

@@ -39,6 +39,7 @@ from dln_jax.metrics.errors import mean_square, normalised_error
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.trees import RigidTreeParameters, Rows, pairs_of
 from dln_jax.runs.arguments import (
+    facts,
     names_in,
     names_listed,
     numbers_of,
@@ -47,7 +48,6 @@ from dln_jax.runs.arguments import (
 )
 from dln_jax.runs.evaluation import bands_of, compiled
 from dln_jax.runs.folder import command_folder
-from dln_jax.runs.logs import facts
 from dln_jax.runs.report import Report, finish, png
 from dln_jax.types import FrictionLaw, InputError
 from dln_jax.zoo.descriptions import Description
