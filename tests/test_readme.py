@@ -121,17 +121,17 @@ def test_commands_in_the_text_parse():
         words = shlex.split(text)
         if words[2].removeprefix("scripts.") not in COMMANDS:
             cases, line = cases_and_line(words)
-            options = parse(arguments_of(cases), prog=text, description=None, line=line, common=CompilationCache)
-            chosen_cases(cases, names_listed(options.own.only))
+            options, _ = parse(arguments_of(cases), prog=text, description=None, line=line, common=CompilationCache)
+            chosen_cases(cases, names_listed(options.only))
             continue
         script, words = script_and_arguments(words)
-        parsed = parse(script.Arguments, prog=script.__name__, description=None, line=words, common=CompilationCache)
-        for name, hint in get_type_hints(type(parsed.own), include_extras=True).items():
+        own, _ = parse(script.Arguments, prog=script.__name__, description=None, line=words, common=CompilationCache)
+        for name, hint in get_type_hints(type(own), include_extras=True).items():
             for shown in (getattr(mark, "metavar", None) for mark in getattr(hint, "__metadata__", ())):
                 if shown and shown.startswith("{"):
                     known = re.match(r"{(.*?)}", shown)[1].split(",")
                     files = (".npz", ".xml", ".urdf") if "FILE" in known else (".npz",)
-                    named = [word for word in str(getattr(parsed.own, name)).split(",") if not word.endswith(files)]
+                    named = [word for word in str(getattr(own, name)).split(",") if not word.endswith(files)]
                     assert set(named) <= {*known, "None"}, (text, name)
 
 

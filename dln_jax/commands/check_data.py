@@ -38,9 +38,9 @@ def main(options: Arguments) -> None:
     from dln_jax.data.splits import with_joints
     from dln_jax.figures.logs import log_figure
     from dln_jax.files import write_bytes, write_json
-    from dln_jax.runs.logs import facts
+    from dln_jax.runs.arguments import facts
+    from dln_jax.runs.folder import command_folder
     from dln_jax.runs.report import Report, finish, png
-    from dln_jax.runs.stored_arguments import command_folder
 
     if options.robot is None:
         refuse_given(options, ["lock"], "for joints of --robot")

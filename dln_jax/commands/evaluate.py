@@ -23,9 +23,9 @@ class Arguments(Drawn, Folder, Filtered):
 def main(options: Arguments) -> None:
     """Evaluates the model, and writes the run folder; `InputError` for a log of another plant."""
     from dln_jax.data.log import read_log
-    from dln_jax.runs.logs import facts
+    from dln_jax.runs.arguments import facts
+    from dln_jax.runs.folder import command_folder
     from dln_jax.runs.report import finish
-    from dln_jax.runs.stored_arguments import command_folder
     from dln_jax.runs.training import evaluate
     from dln_jax.zoo.run import load
 

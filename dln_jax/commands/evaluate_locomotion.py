@@ -39,8 +39,8 @@ def main(options: Arguments) -> None:
     """Evaluates the policy, prints and writes the numbers."""
     from dln_jax.commands.locomotion.policies import judge, load_policy
     from dln_jax.locomotion.perturbed import numbers_of, perturbed_trials
+    from dln_jax.runs.folder import command_folder
     from dln_jax.runs.report import Report, finish
-    from dln_jax.runs.stored_arguments import command_folder
     from dln_jax.types import require_positive, require_seed
 
     sizes = {"starts": options.starts, "steps": options.steps}

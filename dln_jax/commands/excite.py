@@ -84,9 +84,9 @@ def main(options: Arguments) -> None:
     from dln_jax.mechanics.trees.description import with_payload
     from dln_jax.mechanics.trees.inertia import inertial_parameters
     from dln_jax.models.trees import make_rigid_tree
+    from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import Report, finish
-    from dln_jax.runs.stored_arguments import command_folder
     from dln_jax.sizes import require_memory
     from dln_jax.types import require_positive
 

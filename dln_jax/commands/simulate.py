@@ -83,8 +83,8 @@ def main(options: Arguments) -> None:
     from dln_jax.files import write_figure
     from dln_jax.metrics.report import conditions, write_report
     from dln_jax.precision import data_type
+    from dln_jax.runs.folder import command_folder
     from dln_jax.runs.report import Report, finish
-    from dln_jax.runs.stored_arguments import command_folder
     from dln_jax.softbody.examples import EXAMPLES
     from dln_jax.softbody.mesh.files import write_motion
 

@@ -61,8 +61,8 @@ def main(options: Arguments) -> None:
     from dln_jax.commands.sweeps.job import status_of
     from dln_jax.commands.sweeps.table import compare, print_results, write_tables
     from dln_jax.files import write_figure
+    from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
-    from dln_jax.runs.stored_arguments import command_folder
 
     require_positive_if_given(options, ("jobs", "gpus"))
     grid, fixed, where = grid_of(options.grid or ""), pairs("--fixed", options.fixed), options.where or "here"

@@ -17,7 +17,7 @@ import tyro
 from dln_jax.learning.fits.settings import Automatic, Kernel, LearnedTree, Network, Trigonometric
 from dln_jax.options import Unstated
 from dln_jax.runs.arguments import Variants
-from dln_jax.runs.options import Devices, Drawn, Filtered, Limited, Resumable, Scaled, SceneName
+from dln_jax.runs.options import Devices, Drawn, Filtered, Limited, Logged, Resumable, Scaled, SceneName
 
 NETWORK, AUTO = "structured-delan", "auto"
 ModelName = Annotated[
@@ -118,23 +118,20 @@ def class_of(stated: Mapping[str, Any]) -> type:
     return CLASSES.get(str(model), NetworkOptions)
 
 
-VARIANTS = Variants(
-    class_of,
-    {
-        NetworkOptions: "networks, such as --model structured-delan",
-        TrigonometricOptions: "--model trigonometric",
-        KernelOptions: "--model trigonometric-kernel",
-        AutomaticOptions: "--model auto",
-        TreeOptions: "--model learned-tree",
-    },
-)
-
-
 @dataclass(frozen=True)
 class Arguments(Plant):
     """What to train on, how, and where the results go; `VARIANTS` says which options a model has."""
 
-    VARIANTS: ClassVar = VARIANTS
+    VARIANTS: ClassVar = Variants(
+        class_of,
+        {
+            NetworkOptions: "networks, such as --model structured-delan",
+            TrigonometricOptions: "--model trigonometric",
+            KernelOptions: "--model trigonometric-kernel",
+            AutomaticOptions: "--model auto",
+            TreeOptions: "--model learned-tree",
+        },
+    )
     model: Unstated[ModelName] = None
 
 
@@ -158,13 +155,13 @@ def train(options: Options, command: str) -> None:
     from dln_jax.learning.fit import with_uncertainty
     from dln_jax.process import deadline
     from dln_jax.runs.evaluation import evaluate
+    from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import finish
     from dln_jax.runs.scaled import mesh_of
-    from dln_jax.runs.stored_arguments import command_folder
     from dln_jax.types import require_positive
 
-    seconds = getattr(options, "seconds", None)
+    seconds = options.seconds if isinstance(options, Limited) else None
     if seconds is not None:
         require_positive(seconds=seconds)
     until, mesh = deadline(seconds), mesh_of(options) if isinstance(options, Devices) else None
@@ -185,7 +182,7 @@ def train(options: Options, command: str) -> None:
             fit = with_uncertainty(fit, parts, log.torque, print)
             fit.save(folder)
         report = evaluate(fit, parts, log, mesh=mesh)
-        limited = seconds is not None or getattr(options, "steps", None) is not None
+        limited = seconds is not None or (isinstance(options, Network) and options.steps is not None)
         if report.error:
             report = report._replace(error=report.error.replace("the model", str(folder), 1))
         finish(folder, options, report._replace(ended_by_user=fit.optimiser is not None and limited))
@@ -195,8 +192,7 @@ def read(options: Options) -> Any:
     """The log that the options name, and its test."""
     from dln_jax.data.log import log_of, read_log
     from dln_jax.data.robots import read_robot
-    from dln_jax.runs.arguments import names_listed, refuse_given
-    from dln_jax.runs.logs import cutoff, facts, needs_of, refuse_facts
+    from dln_jax.runs.arguments import cutoff, facts, names_listed, needs_of, refuse_given
     from dln_jax.scenes.datasets.generators import CHARACTERS_TEST, default_data
     from dln_jax.scenes.pendulums import two_link_arm
     from dln_jax.scenes.registry import scene_named
@@ -219,7 +215,8 @@ def read(options: Options) -> Any:
         log = read_log(options.data, more=more, **facts(options), **known)
     else:
         assert scene is not None
-        refuse_facts(options)
+        of_file = [field.name for field in dataclasses.fields(Logged)]
+        refuse_given(options, of_file, "for a file: add --data")
         log = log_of(default_data(scene), f"default data of {scene.name}", cutoff=cutoff(options.cutoff), **known)
         if test is None and scene.name == "two-link-arm":
             test = ",".join(CHARACTERS_TEST)

@@ -42,9 +42,9 @@ def main(options: Arguments) -> None:
     from dln_jax.figures.training import OF_LOSSES, training_curve
     from dln_jax.learning.engine.checkpoint import Checkpoint, identity
     from dln_jax.learning.engine.problem import losses
+    from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import Report, finish, png
-    from dln_jax.runs.stored_arguments import command_folder
     from dln_jax.types import require_seed
     from dln_jax.zoo.descriptions import build
     from dln_jax.zoo.run import save

@@ -186,10 +186,10 @@ def main(options: Options) -> None:
     from dln_jax.learning.engine.optimisers import optimiser_named
     from dln_jax.process import deadline
     from dln_jax.runs.arguments import require_positive_if_given
+    from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import finish
     from dln_jax.runs.scaled import mesh_of
-    from dln_jax.runs.stored_arguments import command_folder
     from dln_jax.types import require_seed
     from dln_jax.zoo.run import save
 
@@ -239,8 +239,7 @@ def main(options: Options) -> None:
 def read(options: Options) -> "PhaseLog":
     """The motions of the task."""
     from dln_jax.commands.phase_spaces.data import generate, read_motions
-    from dln_jax.runs.arguments import numbers_of
-    from dln_jax.runs.logs import facts, needs_of
+    from dln_jax.runs.arguments import facts, needs_of, numbers_of
 
     if not isinstance(options, Recorded):
         return generate(options.task, options.trajectories)

@@ -73,10 +73,10 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
     from dln_jax.locomotion.perturbed import numbers_of, perturbed_trials
     from dln_jax.locomotion.task import CLOCK_PERIOD, creature_named, make_task
     from dln_jax.locomotion.worlds import Variation
+    from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import Report, finish, png
     from dln_jax.runs.scaled import mesh_of
-    from dln_jax.runs.stored_arguments import command_folder
     from dln_jax.scale import device_lines, shares
     from dln_jax.softbody.terms.creature import TIME_STEP
     from dln_jax.types import require_positive, require_seed

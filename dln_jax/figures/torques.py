@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.figures import style
-from dln_jax.metrics.coverage import LEVEL, coverage, half_width
+from dln_jax.metrics.errors import LEVEL, LEVELS, coverage, half_width
 from dln_jax.metrics.motions import Motion, valid_prediction_times
 
 PARTS = {"tau": "torque", "tau_inertial": "inertial", "tau_coriolis": "Coriolis", "tau_gravity": "gravity"}
@@ -166,8 +166,8 @@ def torque_bands(
     axes[-1].set_xlabel("held-out sample; grey: out of distribution")
     right.plot([0, 1], [0, 1], color=style.REFERENCE, linewidth=1.0)
     right.fill_between([0, 1], [-0.05, 0.95], [0.03, 1.03], color=style.REFERENCE, alpha=0.15, linewidth=0)
-    for joint, shares in enumerate(covered.shares.T[:d]):
-        right.plot(covered.levels, shares, color=style.CYCLE[joint], linewidth=1.2, label=f"joint {joint + 1}")
+    for joint, shares in enumerate(covered.T[:d]):
+        right.plot(LEVELS, shares, color=style.CYCLE[joint], linewidth=1.2, label=f"joint {joint + 1}")
     right.set(xlim=(0, 1), ylim=(0, 1), xlabel="level of the band", ylabel="share of torques in it")
     style.legend(right, loc="lower right")
     return figure

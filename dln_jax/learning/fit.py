@@ -24,8 +24,8 @@ from dln_jax.precision import data_type
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.catalogue import CATALOGUE, Properties
 from dln_jax.zoo.descriptions import Description, build
+from dln_jax.zoo.parameter_files import save_uncertainty
 from dln_jax.zoo.run import Run, save
-from dln_jax.zoo.uncertainty_files import save_uncertainty
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -31,7 +31,7 @@ from dln_jax.models.joint_friction import FrictionParameters
 from dln_jax.models.kernel import KernelParameters, KernelScales, States, torque_covariance
 from dln_jax.precision import quick_compilation
 from dln_jax.types import InputError, JointKind, Needs, require_positive
-from dln_jax.zoo.catalogue import CATALOGUE
+from dln_jax.zoo.descriptions import make
 
 NOISIER = 3.0
 """The noise is multiplied by this if the covariance is not positive definite to rounding."""
@@ -153,7 +153,7 @@ def choose_kernel(
     for serial in (True, False):
         fit = fit_kernel(needs, train, samples=samples, serial=serial)
         with jax.enable_x64(True):
-            model = CATALOGUE["trigonometric-kernel"].make(needs=needs, samples=fit.samples, serial=serial)
+            model = make("trigonometric-kernel", needs, samples=fit.samples, serial=serial)
             scale = np.asarray(torque_scale(train))
         errors = squared_torque_errors(model, fit.parameters, validation, scale)
         trials.append(Trial(serial, fit, np.sum(errors, axis=1)))

@@ -31,7 +31,7 @@ from dln_jax.precision import quick_compilation
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
 from dln_jax.types import InputError, Needs, require_positive
-from dln_jax.zoo.catalogue import CATALOGUE
+from dln_jax.zoo.descriptions import make
 
 LARGEST_DEGREE = 4
 MOST_PARAMETERS = 1_500
@@ -174,13 +174,12 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
         InputError: the basis of degree 1 is too large, or `fit_linear` refuses the data.
     """
     d = needs.degrees_of_freedom
-    make = CATALOGUE["trigonometric"].make
     scale = np.asarray(torque_scale(train))
     target = ROUNDING**2 * float(np.mean(np.sum((validation.tau / scale) ** 2, axis=1)))
 
     def fit(degrees: tuple[int, ...]) -> tuple[LinearFit, Float[np.ndarray, " N"]]:
         with jax.enable_x64(True):
-            model = make(needs=needs, degree=degrees)
+            model = make("trigonometric", needs, degree=degrees)
             solution = fit_linear(model, train)
         errors = squared_torque_errors(model, solution.parameters, validation, scale)
         return solution, np.sum(errors, axis=1)
@@ -204,7 +203,7 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
 def parameters_of_degree(needs: Needs, degree: int) -> int | None:
     """Number of parameters of the trigonometric model with this degree in every joint; `None` if it is too large."""
     try:
-        model = CATALOGUE["trigonometric"].make(needs=needs, degree=degree)
+        model = make("trigonometric", needs, degree=degree)
     except InputError:
         return None
     return count(jax.eval_shape(model.init, jax.random.key(0)))

@@ -1,9 +1,11 @@
-"""Errors of a model on trajectories, and the definiteness of its mass matrices.
+"""Errors of a model on trajectories, how often they lie within its bands, and the definiteness of its mass matrices.
 
-A kinetic energy has a positive definite M; a black-box network may not.
+The band of level p about a prediction has the half width z_p sd, where a standard normal variable lies between -z_p and
+z_p with probability p: 1.96 sd for 95 %. A kinetic energy has a positive definite M; a black-box network may not.
 """
 
 from collections.abc import Callable
+from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +21,10 @@ from dln_jax.scale import spread
 from dln_jax.types import Hamiltonian, InputError
 
 DECOMPOSITION = ("inertial", "coriolis", "gravity")
+LEVELS = tuple(np.round([*np.arange(0.05, 0.95, 0.05), 0.95, 0.975, 0.99], 3).tolist())
+"""Levels of a coverage curve."""
+LEVEL = 0.95
+"""Level of the bands reported as a single number."""
 
 
 def prediction_program(
@@ -100,6 +106,30 @@ def normalised_error(
 def mean_square(error: np.ndarray) -> float:
     """Returns the mean over samples of the sum of squares over joints; error [N, d]."""
     return float(np.mean(np.sum(error**2, axis=1)))
+
+
+def half_width(level: float) -> float:
+    """Returns z_p, in standard deviations; raises `InputError` for a level outside (0, 1)."""
+    if not 0 < level < 1:
+        raise InputError(f"the level of a band is {level}; expected a number between 0 and 1")
+    return NormalDist().inv_cdf(0.5 + level / 2)
+
+
+def coverage(error: Any, std: Any, levels: tuple[float, ...] = LEVELS) -> Float[np.ndarray, "n d"]:
+    """Returns the shares of errors within z_p standard deviations, by level and joint.
+
+    Args:
+        error: predicted minus measured, [N, d].
+        std: predicted standard deviations, [N, d].
+        levels: levels p of the bands.
+
+    Raises:
+        InputError: a level is outside (0, 1), or shapes differ.
+    """
+    error, std = np.asarray(error, np.float64), np.asarray(std, np.float64)
+    if error.shape != std.shape or error.ndim != 2 or not len(error):
+        raise InputError(f"error is {error.shape} and std {std.shape}; expected the same [N, d] with N >= 1")
+    return np.array([np.mean(np.abs(error) <= half_width(level) * std, axis=0) for level in levels])
 
 
 class Definiteness(NamedTuple):

@@ -25,6 +25,7 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.scenes.datasets.hamiltonian_tasks import PhaseSamples
 from dln_jax.types import Hamiltonian
 
+TOLERANCE = 1e-9
 MOST_STEPS = 5_000
 """Largest number of integrator steps of a predicted motion."""
 
@@ -63,11 +64,9 @@ def predict(
     q: Float[np.ndarray, "K d"],
     p: Float[np.ndarray, "K d"],
     t: Float[np.ndarray, " T"],
-    *,
-    tolerance: float = 1e-9,
 ) -> Motions:
-    """Predicts motions from the states at t[0], integrated adaptively to the tolerance per step."""
-    states, successful = _motions(model, parameters, jnp.asarray(q), jnp.asarray(p), jnp.asarray(t), tolerance)
+    """Predicts motions from the states at t[0], integrated adaptively to `TOLERANCE` per step."""
+    states, successful = _motions(model, parameters, *map(jnp.asarray, (q, p, t)))
     finished = np.asarray(successful)[:, None, None]
     q_hat, p_hat = (np.where(finished, np.asarray(state), np.inf) for state in states)
     return Motions(np.asarray(t), q_hat, p_hat)
@@ -78,7 +77,7 @@ def energies(H: Hamiltonian, motions: Motions) -> Float[np.ndarray, "K T"]:
     return finite_or_infinite(np.asarray(_along(H, jnp.asarray(motions.q), jnp.asarray(motions.p))))
 
 
-def finite_or_infinite(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+def finite_or_infinite(values: np.ndarray | np.floating) -> np.ndarray:
     """Replaces values that are not finite by infinity, so that a NaN never counts as a small error."""
     return np.where(np.isfinite(values), values, np.inf)
 
@@ -161,12 +160,12 @@ def _rates(model: Model, parameters, q, p):
     return jax.vmap(flow(model.energies(parameters)).rates)(q, p)
 
 
-@functools.partial(jax.jit, static_argnames=("model", "tolerance"))
-def _motions(model: Model, parameters, q, p, t, tolerance: float):
+@functools.partial(jax.jit, static_argnames=("model",))
+def _motions(model: Model, parameters, q, p, t):
     rates = flow(model.energies(parameters)).rates
 
     def motion(q, p):
-        return adaptive_rollout(lambda t, state: rates(*state), (q, p), t, tolerance=tolerance, max_steps=MOST_STEPS)
+        return adaptive_rollout(lambda t, state: rates(*state), (q, p), t, tolerance=TOLERANCE, max_steps=MOST_STEPS)
 
     return jax.vmap(motion)(q, p)
 

@@ -27,6 +27,7 @@ the mean of the test motions, or the variance of the data::
     rates      measured rates at the test states must be explained by the same two limits
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
@@ -168,9 +169,9 @@ def judge(errors: HeldOut, names: Sequence[str] | None = None, *, quantity: str 
         constant = f"the {quantity} of {_listed(names, unexplained)} is predicted no better than by a constant"
         remedy = "check the sign, order and unit of tau, and the times of the log (check_data), or record more motions"
         return Verdict("refused", f"{constant if unexplained.any() else beyond}: {numbers}", remedy)
-    worse = 0.0 if errors.file is None else share.mean() - np.mean(errors.file / errors.unit)
-    if errors.file is not None and worse > WORSE:
-        level = "refused" if share.mean() > MUCH_WORSE * np.mean(errors.file / errors.unit) else "doubtful"
+    of_file = np.inf if errors.file is None else np.mean(errors.file / errors.unit)
+    if share.mean() > of_file + WORSE:
+        level = "refused" if share.mean() > MUCH_WORSE * of_file else "doubtful"
         remedy = "keep the file's values, or record more and different motions"
         return Verdict(level, f"the robot's file predicts held-out torques better: {numbers}", remedy)
     doubtful = (share > UNEXPLAINED + NOISE * noise) & ~unseen
@@ -284,4 +285,4 @@ def _numbers(errors: HeldOut, share: np.ndarray, noise: np.ndarray, names: Seque
 
 
 def _listed(names: Sequence[str], chosen: np.ndarray) -> str:
-    return ", ".join(name for name, is_chosen in zip(names, chosen, strict=True) if is_chosen)
+    return ", ".join(itertools.compress(names, chosen))

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from types import NoneType
-from typing import Annotated, Any, NamedTuple, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args
 
 import tyro
 from tyro._errors import BadValue, InstantiationFailure, InvalidChoice, ParseErrorEvent, on_parse_error
@@ -14,9 +14,11 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 
 from dln_jax.errors import InputError
 from dln_jax.runs.help import help_text
+from dln_jax.runs.options import Checked, Filtered, Logged
 from dln_jax.sizes import require_magnitude
 
-Arguments = TypeVar("Arguments")
+if TYPE_CHECKING:
+    from dln_jax.types import Needs
 
 _rules = ConstructorRegistry()
 
@@ -24,10 +26,9 @@ _rules = ConstructorRegistry()
 @_rules.primitive_rule
 def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     """Reads int and float, with error messages in the style of all others."""
-    kinds = {int: "a whole number", float: "a number"}
-    if info.type not in kinds:
+    kind, wanted = info.type, {int: "a whole number", float: "a number"}.get(info.type)
+    if wanted is None:
         return None
-    kind, wanted = info.type, kinds[info.type]
 
     def read(words: list[str]) -> Any:
         try:
@@ -90,10 +91,10 @@ def arguments_of(arguments: type, **stated: Any) -> Any:
     return whole(**stated)
 
 
-def parse(
-    arguments: type, *, prog: str, description: str | None, line: Sequence[str], common: type | None = None
-) -> Any:
-    """Parses a command line; `--help` and `--help-all` print the help and exit.
+def parse(arguments: type, *, prog: str, description: str | None, line: Sequence[str], common: type) -> tuple[Any, Any]:
+    """Parses a command line into the command's own and the common options.
+
+    `--help` and `--help-all` print the help and exit.
 
     Args:
         prog: the command as the user typed it.
@@ -111,10 +112,8 @@ def parse(
     def refuse(event: ParseErrorEvent) -> None:
         raise InputError(f"{_complaint(event, arguments)} (see {prog} --help)")
 
-    fields: list[Any] = [("own", Annotated[whole, tyro.conf.arg(name="")])]
-    if common is not None:
-        fields.append(("common", Annotated[common, tyro.conf.arg(name="")]))
-    both = dataclasses.make_dataclass("Whole", fields)
+    unnamed = tyro.conf.arg(name="")
+    both: Any = tuple[Annotated[whole, unnamed], Annotated[common, unnamed]]
     with on_parse_error(refuse):
         return tyro.cli(both, prog=prog, description=description, args=line, registry=_rules)
 
@@ -231,3 +230,48 @@ def numbers_of(option: str, text: str, counts: Collection[int] = (), *, positive
     for number in numbers:
         require_magnitude(option, number)
     return numbers
+
+
+def facts(options: Logged) -> dict[str, Any]:
+    """Keywords of `data.log.read_log`: facts on a file, and how to filter and check it."""
+    names = {"joints": names_listed(options.joints), "topics": names_listed(options.topics)}
+    factor = None if options.torque_factor is None else torque_factor(options.torque_factor)
+    stated = {"rate": options.rate, "units": options.units, "torque_factor": factor, **names}
+    if isinstance(options, Checked):
+        stated["accept_log"] = options.accept_log
+    if isinstance(options, Filtered):
+        stated["cutoff"] = cutoff(options.cutoff)
+    return stated
+
+
+def torque_factor(text: str) -> float | tuple[float, ...] | dict[str, float]:
+    """Parses --torque-factor: a number, one for each joint, or NAME=NUMBER."""
+    option = "--torque-factor"
+    if "=" in text:
+        pairs = pairs_of(option, text.split(","))
+        return {name: numbers_of(f"{option} {name}", factor, [1])[0] for name, factor in pairs.items()}
+    numbers = numbers_of(option, text)
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+def cutoff(text: str | None) -> Any:
+    """Parses --cutoff: Hz, auto, or inf."""
+    if text in (None, "auto"):
+        return text
+    try:
+        value = float(str(text))
+    except ValueError:
+        value = -1.0
+    if not value > 0:
+        raise InputError(f"--cutoff is {text!r:.40}; expected Hz, a positive number, or auto (inf: no filter)")
+    return value
+
+
+def needs_of(text: str | None) -> "Needs | None":
+    """Parses --needs; `InputError` if the text does not state valid needs."""
+    from dln_jax.data.stated_needs import needs_from_text  # imports JAX
+
+    try:
+        return None if text is None else needs_from_text(text)
+    except InputError as error:
+        raise InputError(f"--{error}; see --help for an example") from None

@@ -7,7 +7,6 @@ the computation, the version of JAX, XLA's options and the kind of processor.
 import functools
 import warnings
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 from filelock import FileLock, Timeout
@@ -21,15 +20,6 @@ LEAST_SECONDS = 0.05
 """Shortest compilation time of a program that is stored; reading one back takes 0.01 s."""
 LOCK = ".lockfile"
 """JAX's lock file: one process at a time reads or writes."""
-
-
-class Compilation(NamedTuple):
-    """Totals of this process's compilation."""
-
-    seconds: float
-    """Compilation time, including programs that came from the cache."""
-    cached: int
-    """Number of programs that came from the cache."""
 
 
 def enable_double_precision() -> None:
@@ -60,25 +50,12 @@ def keep(wanted: bool) -> str:
     return ""
 
 
-def compilation() -> Compilation:
-    """Totals since the first call of this function; subtract two readings to measure an interval."""
-    counts = _counts()
-    return Compilation(counts["seconds"], int(counts["cached"]))
-
-
-def summary(since: Compilation, unkept: str = "") -> str:
-    """Summary of the compilation since a reading, in one line; empty if it was short and used no cached program."""
-    now = compilation()
-    seconds, cached = now.seconds - since.seconds, now.cached - since.cached
-    if seconds < 0.5 and not cached:
-        return ""
-    many = {0: "no program", 1: "one program"}.get(cached, f"{cached} programs")
-    why = f" (none is kept: {unkept})" if unkept else ""
-    return f"compilation took {seconds:.1f} s; {many} came from the cache{why}"
-
-
 @functools.cache
-def _counts() -> dict[str, float]:
+def compilation() -> dict[str, float]:
+    """Totals since the first call of this function, which are updated in place.
+
+    `seconds` is the compilation time, including programs that came from the cache; `cached` is the number of these.
+    """
     counts = {"seconds": 0.0, "cached": 0}
 
     def count(event: str, **_: str | int) -> None:
@@ -90,6 +67,16 @@ def _counts() -> dict[str, float]:
     jax.monitoring.register_event_listener(count)
     jax.monitoring.register_event_duration_secs_listener(add)
     return counts
+
+
+def summary(since: dict[str, float], unkept: str = "") -> str:
+    """Summary of the compilation since a copy of the totals, in one line; empty if it was short and used no cache."""
+    seconds, cached = (now - since[name] for name, now in compilation().items())
+    if seconds < 0.5 and not cached:
+        return ""
+    many = {0: "no program", 1: "one program"}.get(int(cached), f"{cached} programs")
+    why = f" (none is kept: {unkept})" if unkept else ""
+    return f"compilation took {seconds:.1f} s; {many} came from the cache{why}"
 
 
 def _remove_torn(folder: Path) -> None:

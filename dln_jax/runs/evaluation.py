@@ -9,32 +9,33 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from dln_jax.data.encoders.sampling import torque_noise
 from dln_jax.data.log import Log
 from dln_jax.data.parts import Parts
-from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import merged
 from dln_jax.figures.torques import force_decomposition, tip_paths, torque_bands
 from dln_jax.figures.training import training_curve
 from dln_jax.learning.engine.optimisers import Adam, name_of
 from dln_jax.learning.fit import Fit, double
-from dln_jax.learning.kinematics.fit import TreeFit
 from dln_jax.learning.latency import latency_of
 from dln_jax.learning.linear import design, design_chunks
 from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.trees.recursions import tree_system
-from dln_jax.metrics.coverage import LEVEL, coverage
-from dln_jax.metrics.errors import as_arrays, definiteness, errors, mean_square, prediction_program, samples_of
+from dln_jax.metrics.errors import (
+    LEVEL,
+    as_arrays,
+    coverage,
+    errors,
+    mean_square,
+    prediction_program,
+    samples_of,
+)
 from dln_jax.metrics.motions import Motion, by_trajectory, metrics_of_motions, motion_program, records_of
-from dln_jax.metrics.verdict import FAR_FROM_NOISE, HeldOut, Verdict, held_out, judge, verdict_metrics, worst
 from dln_jax.models.model import Model
 from dln_jax.models.uncertainty import Uncertainty, deviation_of_rows, exceeds, scores_of_rows
 from dln_jax.precision import quick_compilation
-from dln_jax.runs.report import Report, png
+from dln_jax.runs.report import Report, cost_metrics, number, png, unit_of
+from dln_jax.runs.verdict import verdict_of
 from dln_jax.types import InputError
 
 SUMMARIES = {"median": np.median, "mean": np.mean, "standard_deviation": np.std, "largest": np.max}
@@ -46,44 +47,36 @@ CEILINGS = {
     "energy_error_j": "energy_error_ceiling_j",
 }
 """Rollout metrics and the names of the true plant's values."""
-FORCE = "force²"
-"""Unit of squared errors of torques, which depends on the joints."""
-METRICS = {
-    "torque_mse": ("torque, mean square error", FORCE, ".2e"),
-    "test_nmse": ("torque, error over variance, mean of joints", "1", ".2e"),
-    "validation_nmse": ("the same, on validation motions", "1", ".2e"),
-    "zero_nmse": ("the same, of a guess of zero", "1", ".2e"),
-    "noise_nmse": ("the same, of the noise of the torques", "1", ".2e"),
-    "file_nmse": ("the same, of the robot's file", "1", ".2e"),
-    "forward_mse": ("acceleration, mean square error", "(1/s²)²", ".2e"),
-    "validation_error": ("validation error, sum over joints", FORCE, ".2e"),
-    "power_mse": ("power, mean square error", "W²", ".2e"),
-    "inertial_mse": ("inertial force, mean square error", FORCE, ".2e"),
-    "coriolis_mse": ("Coriolis force, mean square error", FORCE, ".2e"),
-    "gravity_mse": ("gravity force, mean square error", FORCE, ".2e"),
-    "gravity_determined": ("gravity told from friction: 1 yes, 0 known only in sum", "", ","),
-    "smallest_mass_eigenvalue": ("smallest eigenvalue of the mass matrix", "", ".2e"),
-    "share_not_definite": ("states where the mass matrix is not definite", "", ",.2f"),
-    "largest_condition_number": ("largest condition number of the mass matrix", "", ".2e"),
-    "coverage_95_share": ("torques within the 95 % band", "", ",.2f"),
-    "coverage_95_worst_joint_share": ("the same, at the joint furthest from 95 %", "", ",.2f"),
-    "out_of_distribution_share": ("states out of distribution", "", ",.2f"),
-    "vpt_seconds": ("valid prediction time, torque held", "s", ",.2f"),
-    "vpt_interpolated_seconds": ("valid prediction time, torque interpolated", "s", ",.2f"),
-    "rollout_seconds": ("duration of a test motion", "s", ",.1f"),
-    "normalised_state_error": ("state error of a rollout, in standard deviations", "1", ".2e"),
-    "energy_error_j": ("energy balance error of a rollout", "J", ".2e"),
-    "one_step_p50_us": ("one call of the inverse model, median", "µs", ",.1f"),
-    "one_step_p99_us": ("one call of the inverse model, 99 %", "µs", ",.1f"),
-    "compile_seconds": ("compile seconds", "s", ",.1f"),
-    "train_seconds": ("train seconds", "s", ",.1f"),
-    "twin_degrees": ("twin degrees", "", ",.1f"),
-    "twin_metres": ("twin metres", "", ",.1f"),
+LABELS = {
+    "torque_mse": "torque, mean square error",
+    "test_nmse": "torque, error over variance, mean of joints",
+    "validation_nmse": "the same, on validation motions",
+    "zero_nmse": "the same, of a guess of zero",
+    "noise_nmse": "the same, of the noise of the torques",
+    "file_nmse": "the same, of the robot's file",
+    "forward_mse": "acceleration, mean square error",
+    "validation_error": "validation error, sum over joints",
+    "power_mse": "power, mean square error",
+    "inertial_mse": "inertial force, mean square error",
+    "coriolis_mse": "Coriolis force, mean square error",
+    "gravity_mse": "gravity force, mean square error",
+    "gravity_determined": "gravity told from friction: 1 yes, 0 known only in sum",
+    "smallest_mass_eigenvalue": "smallest eigenvalue of the mass matrix",
+    "share_not_definite": "states where the mass matrix is not definite",
+    "largest_condition_number": "largest condition number of the mass matrix",
+    "coverage_95_share": "torques within the 95 % band",
+    "coverage_95_worst_joint_share": "the same, at the joint furthest from 95 %",
+    "out_of_distribution_share": "states out of distribution",
+    "vpt_seconds": "valid prediction time, torque held",
+    "vpt_interpolated_seconds": "valid prediction time, torque interpolated",
+    "rollout_seconds": "duration of a test motion",
+    "normalised_state_error": "state error of a rollout, in standard deviations",
+    "energy_error_j": "energy balance error of a rollout",
+    "one_step_p50_us": "one call of the inverse model, median",
+    "one_step_p99_us": "one call of the inverse model, 99 %",
 }
-"""Label, unit and format of a metric by its name; other names explain themselves."""
-AT_NOISE = 2.0
-"""Held-out errors of a tree with unknown frames, in units of the noise variance, up to which its frames are right;
-above `FAR_FROM_NOISE` they may be wrong."""
+"""Labels of metrics; other names explain themselves."""
+UNITS = {"forward_mse": "(1/s²)²", "power_mse": "W²", "normalised_state_error": "1", "energy_error_j": "J"}
 CHUNK = 256
 """Number of samples per call of the program that linearises the torques in the parameters."""
 
@@ -102,16 +95,13 @@ def evaluate(
     """
     test, training = parts.sets.test, fit.training
     # The test samples are followed by the validation samples, so that one program predicts both.
-    keys = [key for key in ("q", "qd", "qdd", "tau", "p", "pd") if getattr(test, key) is not None]
-    both = test._replace(
-        **{key: np.concatenate([getattr(part, key) for part in (test, parts.sets.validation)]) for key in keys}
-    )
-    samples = samples_of(both, fit.dtype)
+    both = (samples_of(part, fit.dtype) for part in (test, parts.sets.validation))
+    samples = jax.tree.map(lambda *arrays: np.concatenate(arrays), *both)
     predict = compiled(prediction_program(fit.model.energies, mesh=mesh))
     answers = as_arrays(predict(fit.parameters, samples))
     predicted = {name: array[: len(test.t)] for name, array in answers.items()}
     motions, of_rollouts = rollouts(fit, test, log, say)
-    verdict, of_verdict = verdict_of(fit, fit.dynamics, parts, log, answers, motions)
+    verdict, of_verdict = verdict_of(fit, parts, log, answers, motions)
     spread, seeds = {}, np.size(fit.seeds)
     if seeds > 1:
         of_seeds = [predict(fit.of_seed(index), samples)["tau"] for index in range(seeds)]
@@ -120,8 +110,6 @@ def evaluate(
     figures = figures_of(fit, parts, log, motions, predicted)
     of_bands, of_figures = bands_of(fit, test, predicted["tau"])
     figures |= of_figures
-    latency = latency_of(fit, test)
-    validation = np.ravel(training.validation)
     metrics = {
         **errors(predicted, test),
         "gravity_determined": int(not fit.summed(parts)),
@@ -129,20 +117,20 @@ def evaluate(
         **spread,
         **of_bands,
         **of_rollouts,
-        **({"validation_error": float(validation[fit.best])} if training.history else {}),
-        "parameters": sum(np.size(leaf) for leaf in jax.tree.leaves(fit.parameters)),
-        "steps": training.stop.step,
-        "best_step": int(np.ravel(training.best_step)[fit.best]),
-        "compile_seconds": training.compile_seconds,
-        "train_seconds": training.train_seconds,
-        "one_step_p50_us": latency.p50_us,
-        "one_step_p99_us": latency.p99_us,
+        **({"validation_error": float(np.ravel(training.validation)[fit.best])} if training.history else {}),
+        **cost_metrics(
+            training,
+            latency_of(fit, test),
+            parameters=sum(np.size(leaf) for leaf in jax.tree.leaves(fit.parameters)),
+            best_step=int(np.ravel(training.best_step)[fit.best]),
+        ),
     }
+    columns, rows = table_of(metrics, fit)
     return Report(
         metrics=metrics,
-        rows=rows_of(metrics, fit),
+        rows=rows,
         title=f"test on {log.name}, {fit.description['precision']}",
-        columns=columns_of(metrics),
+        columns=columns,
         verdict=verdict,
         figures=figures,
         chosen=choices_of(fit, parts, log),
@@ -178,105 +166,6 @@ def rollouts(
     return by_trajectory(motions, test)["interpolated"], metrics
 
 
-def verdict_of(
-    fit: Fit,
-    functions: Dynamics | PlainDynamics,
-    parts: Parts,
-    log: Log,
-    answers: dict[str, np.ndarray],
-    motions: list[Motion],
-) -> tuple[Verdict, dict[str, float | int]]:
-    """The most severe verdict from held-out motions, mass matrices, rollouts and the search, and its metrics.
-
-    Accelerations are judged if the model is fitted to them.
-
-    Args:
-        functions: the model's.
-        answers: the model's `tau` and `qdd` [N, d] on the test motions, followed by the validation motions.
-        motions: rollouts of the test motions, possibly none.
-    """
-    sets, robot, numbers = parts.sets, log.robot, {}
-    noise = torque_noise(sets.train) if log.torque_noise is None else log.torque_noise
-    whole, names = merged(sets), None if robot is None else robot.tree.names
-    count = len(sets.test.t)
-    judged = {"test": (slice(count), sets.test), "validation": (slice(count, None), sets.validation)}
-    judged = {name: (part, data) for name, (part, data) in judged.items() if len(data.t)}
-    held = {
-        name: held_out(
-            answers["tau"][part],
-            data.tau,
-            noise=noise,
-            file=None if robot is None else torques_of(robot, data),
-            recording=whole.tau if parts.blocks else None,
-        )
-        for name, (part, data) in judged.items()
-    }
-    verdicts = [judge(errors, names) for errors in held.values()]
-    if not fit.objective.of_torques:
-        recording = whole.qdd if parts.blocks else None
-        pairs = judged.values()
-        accelerations = [held_out(answers["qdd"][part], data.qdd, recording=recording) for part, data in pairs]
-        verdicts += [judge(errors, names, quantity="acceleration") for errors in accelerations]
-    remedy = f"try another --degree, --model {'structured-hnn' if fit.properties.canonical else 'structured-delan'}, "
-    remedy += "or more varied motions"
-    if infinite := sum(not np.isfinite([motion.q, motion.qd]).all() for motion in motions):
-        reason = f"{infinite} of {len(motions)} rollouts of test motions are not finite"
-        verdicts.append(Verdict("doubtful", reason, remedy))
-    if fit.properties.energy and not fit.properties.definite:
-        definite = definiteness(functions, whole.q, whole.qd)
-        if (share := definite.share_not_definite) > 0:
-            reason = (
-                f"the mass matrix is not positive definite at {share:.1%} of the states of the data: accelerations and "
-                "rollouts are wrong or infinite there"
-            )
-            verdicts.append(Verdict("refused" if share == 1 else "doubtful", reason, remedy))
-        numbers["smallest_mass_eigenvalue"] = definite.smallest_eigenvalue
-        numbers["share_not_definite"] = definite.share_not_definite
-        numbers["largest_condition_number"] = definite.largest_condition_number
-    if fit.search is not None:
-        of_search, of_descents = verdict_on_search(fit.search, held["test"])
-        verdicts += [] if of_search is None else [of_search]
-        numbers = of_descents | numbers
-    verdict = worst(*verdicts, causes=log.faults)
-    nmse = {f"{name}_nmse": float(np.mean(errors.error / errors.unit)) for name, errors in held.items()}
-    return verdict, {**nmse, **verdict_metrics(held["test"], verdict), **numbers}
-
-
-def torques_of(robot: Robot, data: Trajectories) -> np.ndarray:
-    """Torques [N, d] by the robot's file, friction included."""
-    motion = dynamics(tree_system(robot.tree, joint_dissipation(robot.damping, robot.coulomb)))
-    return np.asarray(compiled(jax.vmap(motion.inverse_dynamics))(data.q, data.qd, data.qdd))
-
-
-def verdict_on_search(search: TreeFit, errors: HeldOut) -> tuple[Verdict | None, dict[str, float | int]]:
-    """Verdict and metrics of a search for joint frames: agreement of its descents, and their errors over the noise."""
-    count, agreeing, twin = len(search.losses), search.agreeing, search.twin
-    numbers: dict[str, float | int] = {"descents": count, "descents_agreeing": agreeing}
-    if twin is not None:
-        off = {"twin_degrees": float(np.degrees(twin.off.angle)), "twin_metres": twin.off.length}
-        numbers |= {**off, "twin_error": twin.error}
-    above = None
-    if errors.noise is not None and (errors.noise > 0).all():
-        above = float(np.mean(errors.error / errors.noise))
-        numbers |= {"error_over_noise": above}
-        if above <= AT_NOISE:
-            return None, numbers
-    if agreeing < search.agreement:
-        reason = f"only {agreeing} of {count} descents reached the lowest loss, so a lower one may exist"
-        remedy = "try another --seed, more --seconds or a --kinematic-prior of the arm"
-    elif twin is not None and not twin.same:
-        reason = f"two descents to the same loss found {twin.words}, so the motions do not determine the axes"
-        remedy = "record more and different motions, or add a --kinematic-prior"
-    elif above is not None and above > FAR_FROM_NOISE:
-        reason = f"held-out errors are {above:.2g} times the noise, though {agreeing} descents agree"
-        remedy = (
-            "record more and different motions, or add a --kinematic-prior; friction that the tree lacks looks the same"
-        )
-    else:
-        return None, numbers
-    return Verdict("doubtful", reason, remedy), numbers
-
-
 def bands_of(
     fit: Fit, test: Trajectories, predicted: np.ndarray
 ) -> tuple[dict[str, float], dict[str, Callable[[Path], None]]]:
@@ -290,7 +179,7 @@ def bands_of(
     if fit.uncertainty is None:
         return {}, {}
     std, out_of_distribution = bands(double(fit), fit.parameters, fit.uncertainty, test)
-    shares = coverage(predicted - test.tau, std, levels=(LEVEL,)).shares[0]
+    shares = coverage(predicted - test.tau, std, levels=(LEVEL,))[0]
     metrics = {
         "coverage_95_share": float(shares.mean()),
         "coverage_95_worst_joint_share": float(shares[np.argmax(abs(shares - LEVEL))]),
@@ -305,16 +194,15 @@ def bands(model: Model, parameters: Any, uncertainty: Uncertainty, data: Traject
     Args:
         model: the model in float64.
     """
-    std, flags, first = [], [], 0
+    answers, first = [], 0
     with jax.enable_x64(True):
         parameters = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), parameters)
         for rows, *_ in design_chunks(design(model), parameters, data, CHUNK, even=False):
             part = slice(first, first + len(rows))
-            deviations, out = _bands(uncertainty, rows, (data.q[part], data.qd[part], data.qdd[part]))
-            std.append(deviations)
-            flags.append(out)
+            answers.append(_bands(uncertainty, rows, (data.q[part], data.qd[part], data.qdd[part])))
             first = part.stop
-    return np.concatenate(std), np.concatenate(flags)
+    std, flags = map(np.concatenate, zip(*answers, strict=True))
+    return std, flags
 
 
 @jax.jit
@@ -343,33 +231,23 @@ def figures_of(
     return figures
 
 
-def columns_of(metrics: dict[str, float | int]) -> tuple[str, ...]:
-    """Columns of the printed table, with one for the true plant if it is known."""
+def table_of(metrics: dict[str, float | int], fit: Fit) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Columns and rows of the printed table; rollout metrics also show the true plant's values, if it is known."""
+    force = "(N m)²" if set(fit.needs.joints) == {"revolute"} else "(N m or N)²"
+    units = {**UNITS, "validation_error": force if fit.objective.selects_by == "torque" else "1"}
     known = any(ceiling in metrics for ceiling in CEILINGS.values())
-    return ("quantity", "value", *["true plant"] * known, "unit")
-
-
-def rows_of(metrics: dict[str, float | int], fit: Fit) -> list[tuple[str, ...]]:
-    """Rows of the printed table; rollout metrics also show the true plant's values."""
-    force = "N m" if set(fit.needs.joints) == {"revolute"} else "N m or N"
-    known = len(columns_of(metrics)) == 4
     lines = []
     for key, value in metrics.items():
         if key in CEILINGS.values() or key == "verdict":
             continue
-        label, unit, form = METRICS.get(key) or (
-            key.replace("_", " "),
-            FORCE if "_mse" in key else "",
-            "," if isinstance(value, int) else ".2e",
-        )
-        if key == "validation_error" and fit.objective.selects_by != "torque":
-            unit = "1"
+        unit = "1" if "_nmse" in key else force if "_mse" in key else ""
         ceiling = metrics.get(CEILINGS.get(key, ""))
-        beside = ["" if ceiling is None else f"{ceiling:{form}}"] * known
-        lines.append((label, f"{value:{form}}", *beside, f"({force})²" if unit == FORCE else unit))
+        beside = ["" if ceiling is None else number(key, ceiling)] * known
+        label = LABELS.get(key, key.replace("_", " "))
+        lines.append((label, number(key, value), *beside, units.get(key, unit) or unit_of(key, {})))
     calls = f"{1e6 / metrics['one_step_p50_us']:,.0f}"
     lines.append(("calls of the inverse model", calls, *[""] * known, "1/s"))
-    return lines
+    return ("quantity", "value", *["true plant"] * known, "unit"), lines
 
 
 def choices_of(fit: Fit, parts: Parts, log: Log) -> dict[str, Any]:

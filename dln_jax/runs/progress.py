@@ -18,6 +18,14 @@ def progress(
 ) -> Iterator[Callable[[int, str], None]]:
     """Yields `show(done, text)`. Count, text and time left fit in 80 columns; the bar takes the rest of the line."""
     console = console or Console()
+    first: list[tuple[int, float]] = []
+
+    def rate(done: int, now: float) -> str:
+        """Steps per second since the first call."""
+        first[:] = first or [(done, now)]
+        steps, elapsed = done - first[0][0], now - first[0][1]
+        return f"{steps / elapsed:.0f} {unit}/s" if elapsed > 0 and steps > 0 else ""
+
     if console.is_terminal:
         columns = [
             MofNCompleteColumn(),
@@ -30,26 +38,19 @@ def progress(
             columns.insert(1, TextColumn("{task.fields[rate]}"))
         with Progress(*columns, console=console, expand=True) as bar:
             task = bar.add_task("compiling", total=total, rate="", left="left")
-            first: list[tuple[int, float]] = []
 
             def show(done: int, text: str) -> None:
-                first.append((done, time.monotonic())) if not first else None
-                bar.update(task, completed=done, description=text, rate=_rate(first[0], done, unit))
+                bar.update(task, completed=done, description=text, rate=rate(done, time.monotonic()))
 
             yield show
     else:
-        first, last = [], [0.0]
+        last = [0.0]
 
         def show_line(done: int, text: str) -> None:
             now = time.monotonic()
-            first.append((done, now)) if not first else None
+            per_second = rate(done, now)
             if done >= total or now - last[0] >= SECONDS_BETWEEN_LINES:
                 last[0] = now
-                print(f"{done}/{total} {unit}  {text}  {_rate(first[0], done, unit)}".rstrip(), flush=True)
+                print(f"{done}/{total} {unit}  {text}  {per_second}".rstrip(), flush=True)
 
         yield show_line
-
-
-def _rate(first: tuple[int, float], done: int, unit: str) -> str:
-    elapsed = time.monotonic() - first[1]
-    return f"{(done - first[0]) / elapsed:.0f} {unit}/s" if elapsed > 0 and done > first[0] else ""

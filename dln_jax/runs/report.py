@@ -13,7 +13,7 @@ from dln_jax.files import write_figure, write_json
 from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.latency import Latency
 from dln_jax.metrics.verdict import Verdict
-from dln_jax.runs.stored_arguments import write_config
+from dln_jax.runs.folder import write_config
 
 
 class Report(NamedTuple):
@@ -79,8 +79,8 @@ def finish(folder: Path, options: Any, report: Report) -> None:
 def print_numbers(
     rows: Iterable[Sequence[str]],
     *,
-    title: str | None = None,
-    columns: Sequence[str] = ("quantity", "value", "unit"),
+    title: str,
+    columns: Sequence[str],
     width: int | None = None,
 ) -> None:
     """Prints a table of quantities, their values and units, `width` columns wide (default: the terminal's)."""
@@ -105,13 +105,14 @@ def number(metric: str, value: int | float) -> str:
     return f"{value:,.2f}" if "share" in metric or metric.startswith("vpt") else f"{value:,.1f}"
 
 
-def one_step_metrics(latency: Latency) -> dict[str, float]:
-    """Latency metrics of single calls."""
-    return {"one_step_p50_us": latency.p50_us, "one_step_p99_us": latency.p99_us}
-
-
 def cost_metrics(training: Training, latency: Latency, *, parameters: int, best_step: int) -> dict[str, float | int]:
     """Costs of training a model and of its calls."""
-    seconds = {"compile_seconds": training.compile_seconds, "train_seconds": training.train_seconds}
-    steps = {"parameters": parameters, "steps": training.stop.step, "best_step": best_step}
-    return {**steps, **seconds, **one_step_metrics(latency)}
+    return {
+        "parameters": parameters,
+        "steps": training.stop.step,
+        "best_step": best_step,
+        "compile_seconds": training.compile_seconds,
+        "train_seconds": training.train_seconds,
+        "one_step_p50_us": latency.p50_us,
+        "one_step_p99_us": latency.p99_us,
+    }

@@ -42,7 +42,7 @@ def run(
         description: what the command does, for its help (default: the docstring of the module of `main`).
         began: reading of `time.perf_counter` at the start of a process that runs only this command, whose compiled
             programs are then kept and whose time limit counts from there (default: a call within a program).
-        joining: seconds that several processes wait for each other to start (default: that of `scale.processes`).
+        joining: seconds that several processes wait for each other to start (default: that of `scale`).
     """
     from_shell = began is not None
     with as_one_line(prog, None):
@@ -50,21 +50,21 @@ def run(
         description = description or sys.modules[main.__module__].__doc__
         line = sys.argv[1:] if line is None else line
         try:
-            whole = parse(arguments, prog=prog, description=description, line=line, common=common)
+            own, shared = parse(arguments, prog=prog, description=description, line=line, common=common)
         finally:
             sys.stdout.flush()  # the help; raises BrokenPipeError here if its reader has closed the pipe
-        require_possible(whole.own)
+        require_possible(own)
         # JAX takes a second to import, which the help and a mistake do not need.
         from dln_jax import scale
         from dln_jax.runs import compilation_cache, scaled
-        from dln_jax.runs.stored_arguments import with_stored_arguments
+        from dln_jax.runs.folder import with_stored_arguments
 
         # Data and references are float64; models state their own precision.
         compilation_cache.enable_double_precision()
-        member = scaled.membership_in(whole.own)
-        options = with_stored_arguments(whole.own, arguments) if getattr(whole.own, "resume", False) else whole.own
-        before = compilation_cache.compilation() if from_shell else None
-        unkept = compilation_cache.keep(whole.common.compilation_cache) if from_shell else ""
+        member = scaled.membership_in(own)
+        options = with_stored_arguments(own, arguments) if getattr(own, "resume", False) else own
+        before = compilation_cache.compilation().copy() if from_shell else None
+        unkept = compilation_cache.keep(shared.compilation_cache) if from_shell else ""
 
     start = began if began is not None else time.perf_counter()
 

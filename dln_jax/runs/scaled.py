@@ -11,17 +11,13 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import jax
-from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
 from dln_jax import scale
 from dln_jax.files import PARTIAL
-from dln_jax.runs.options import Scaled
+from dln_jax.runs.options import Drawn, Scaled
 from dln_jax.scale import Membership, backend_started, batch_mesh
 from dln_jax.types import InputError
-
-SEEN_BY_USERS = ("figures",)
-"""Options for output that only the first process produces."""
 
 
 def mesh_of(options: Any) -> Mesh | None:
@@ -59,7 +55,7 @@ def joined(member: Membership, options: Any, *, seconds: int = scale.JOINING) ->
     """
     if backend_started():
         raise InputError("JAX has been used in this process; several are started before it is")
-    own = {"processes", "coordinator", "process_id", "out", *SEEN_BY_USERS}
+    own = {"processes", "coordinator", "process_id", "out", "figures"}
     shared = {
         f"--{key.replace('_', '-')}": str(value) if isinstance(value, Path) else value
         for key, value in dataclasses.asdict(options).items()
@@ -78,7 +74,7 @@ def joined(member: Membership, options: Any, *, seconds: int = scale.JOINING) ->
     here: dict[str, Any] = {"processes": jax.process_count(), "process_id": jax.process_index()}
     if jax.process_index():
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115  open until the process ends
-        here |= {name: False for name in SEEN_BY_USERS if hasattr(options, name)}
+        here |= {"figures": False} if isinstance(options, Drawn) else {}
     return dataclasses.replace(options, **here)
 
 
@@ -95,17 +91,6 @@ def end_at_once(code: int) -> NoReturn:
         with contextlib.suppress(OSError):
             stream.flush()
     os._exit(code)
-
-
-def is_first(options: Any) -> bool:
-    """Whether this process writes the results."""
-    return not getattr(options, "process_id", None)
-
-
-def wait_for_all(options: Any) -> None:
-    """Waits until all processes have reached this call."""
-    if (getattr(options, "processes", None) or 1) > 1:
-        multihost_utils.sync_global_devices("all are here")
 
 
 @contextlib.contextmanager

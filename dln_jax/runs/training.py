@@ -102,8 +102,7 @@ def identify(
 
     require_double_precision("identify")
     robot = robot if isinstance(robot, Robot) else read_robot(Path(robot))
-    if not isinstance(log, Log):
-        log = log_of(log, "the data", robot=robot) if isinstance(log, Trajectories) else read_log(log, robot=robot)
+    log = as_log(log, robot=robot)
     if log.needs.joints != robot.tree.joints:
         raise InputError(f"{log.name} has other joints than the robot; read it by read_log(..., robot=...)")
     log = log._replace(robot=log.robot or robot)
@@ -133,8 +132,8 @@ def evaluate(run: Run | str | Path, log: Log | Trajectories | str | Path) -> "Re
     return evaluate_fit(fit, Parts(Split(log.data, empty, log.data)), log)
 
 
-def as_log(log: Log | Trajectories | str | Path) -> Log:
+def as_log(log: Log | Trajectories | str | Path, robot: Robot | None = None) -> Log:
     """The log of a file or of trajectories; a log itself."""
     if isinstance(log, Log):
         return log
-    return log_of(log, "the data") if isinstance(log, Trajectories) else read_log(log)
+    return log_of(log, "the data", robot=robot) if isinstance(log, Trajectories) else read_log(log, robot=robot)

@@ -7,7 +7,6 @@ A name is the same on command lines, in files, in tables and beside published nu
 import functools
 import inspect
 from collections.abc import Callable, Mapping
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -33,7 +32,7 @@ from dln_jax.models.kernel import make_trigonometric_kernel
 from dln_jax.models.latent_phase import make_image_model
 from dln_jax.models.model import Model, make_black_box_lagrangian, make_delan
 from dln_jax.models.residual import make_residual, make_with_residual
-from dln_jax.models.trees import Number, make_rigid_tree, make_serial_tree
+from dln_jax.models.trees import make_rigid_tree, make_serial_tree
 from dln_jax.models.trigonometric import make_planar_chain, make_trigonometric
 from dln_jax.types import InputError, Needs
 
@@ -61,17 +60,11 @@ class Entry(NamedTuple):
     factory: Callable[..., Any]
     """Makes the model from keywords, including `needs` and `dtype` if it takes them."""
     properties: Properties
-    sizes: Mapping[str, tuple[str, ...]] = MappingProxyType({})
+    sizes: Mapping[str, tuple[str, ...]] = {}
     """Keywords that are typical sizes, and the arrays of `Trajectories` whose standard deviation sets each."""
     additions: tuple[Callable[..., Model], ...] = ()
     """Terms that are added to the factory's model, the last one first. Each is a function of `make`, which makes the
     model for other needs, of `needs`, and of keywords of its own."""
-
-    def make(self, **keywords: Any) -> Any:
-        """Makes the model, additions included, from their keywords; `dtype` defaults to that of the factory."""
-        default = inspect.signature(self.factory).parameters.get("dtype")
-        own = {} if default is None else {"dtype": default.default}
-        return assembled((*self.additions, self.factory), {**own, **keywords})
 
 
 def assembled(functions: tuple[Callable[..., Any], ...], keywords: Mapping[str, Any]) -> Any:
@@ -83,14 +76,13 @@ def assembled(functions: tuple[Callable[..., Any], ...], keywords: Mapping[str, 
     return first(lambda needs: assembled(tuple(rest), {**keywords, "needs": needs}), **own)
 
 
-def friction_laws(make: Callable[[Needs], Model], needs: Needs, *, dtype: DTypeLike = jnp.float32) -> Model:
-    """Adds the friction laws that the needs name."""
-    return with_joint_friction(make(needs._replace(joint_friction=())), needs, linear=False, dtype=dtype)
+def friction_laws(*, linear: bool) -> Callable[..., Model]:
+    """The addition of the friction laws that the needs name, to a model that is `linear` in its parameters or not."""
 
+    def add(make: Callable[[Needs], Model], needs: Needs, *, dtype: DTypeLike = jnp.float32) -> Model:
+        return with_joint_friction(make(needs._replace(joint_friction=())), needs, linear=linear, dtype=dtype)
 
-def linear_friction_laws(make: Callable[[Needs], Model], needs: Needs, *, dtype: DTypeLike = jnp.float32) -> Model:
-    """Adds the friction laws that the needs name to a model that is linear in its parameters."""
-    return with_joint_friction(make(needs._replace(joint_friction=())), needs, linear=True, dtype=dtype)
+    return add
 
 
 @functools.wraps(make_residual)
@@ -99,48 +91,24 @@ def residual_network(make: Callable[[Needs], Model], needs: Needs, **keywords: A
     return make_with_residual(make(needs), make_residual(needs, **keywords))
 
 
-def make_stored_tree(
-    needs: Needs,
-    *,
-    tree: dict[str, Any],
-    velocity_scale: Number = 0.01,
-    stribeck_velocity: Number = 0.1,
-    sigmoid_slope: Number = 10.0,
-    sigmoid_shift: Number = 0.0,
-    load: Number = 0.0,
-    cooling: Number = 0.0,
-    reference_temperature: float = 25.0,
-    temperature: float | None = None,
-    motors: tuple[tuple[float, ...], ...] | None = None,
-    coupled: tuple[tuple[int, int], ...] = (),
-    dtype: DTypeLike = jnp.float64,
-) -> Model:
+def make_stored_tree(needs: Needs, *, tree: dict[str, Any], **keywords: Any) -> Model:
     """`make_rigid_tree` for a tree from `mechanics.trees.tree_to_json`, with the friction named by the needs."""
     frames = tree_from_json(tree)
     if (frames.joints, frames.needs.gravity) != (needs.joints, needs.gravity):
         raise InputError(
             f"the rigid tree has the joints {frames.joints}, and gravity if it is not zero; it got {needs}"
         )
-    return make_rigid_tree(
-        frames,
-        friction=needs.joint_friction or needs.friction,
-        velocity_scale=velocity_scale,
-        stribeck_velocity=stribeck_velocity,
-        sigmoid_slope=sigmoid_slope,
-        sigmoid_shift=sigmoid_shift,
-        load=load,
-        cooling=cooling,
-        reference_temperature=reference_temperature,
-        temperature=temperature,
-        motors=motors,
-        coupled=coupled,
-        dtype=dtype,
-    )
+    return make_rigid_tree(frames, friction=needs.joint_friction or needs.friction, **keywords)
 
+
+# Descriptions state every keyword, so its signature names those of `make_rigid_tree`.
+_own, _rigid = (inspect.signature(function).parameters for function in (make_stored_tree, make_rigid_tree))
+_shared = [parameter for name, parameter in _rigid.items() if name not in ("tree", "friction")]
+make_stored_tree.__signature__ = inspect.Signature([_own["needs"], _own["tree"], *_shared])  # type: ignore
 
 MOMENTUM = {"momentum_scale": ("p",)}
-LAWS, LINEAR = (friction_laws,), (linear_friction_laws,)
-NETWORK = (friction_laws, make_dissipative)
+LAWS, LINEAR = (friction_laws(linear=False),), (friction_laws(linear=True),)
+NETWORK = (*LAWS, make_dissipative)
 RATES = {"rate_scale": ("qd",), "acceleration_scale": ("qdd",), "tau_scale": ("tau",)}
 CATALOGUE = {
     "structured-delan": Entry(make_delan, Properties(definite=True), additions=LAWS),

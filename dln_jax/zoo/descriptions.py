@@ -109,8 +109,7 @@ def build(description: Description, *, factory: Callable[..., Any] | None = None
         raise InputError(f"model description: name is {reprlib.repr(name)}, expected that of a model; {REMEDY}")
     if factory is None and name in CATALOGUE:
         with contextlib.suppress(TypeError):  # values that JSON does not have, which are refused below
-            text = json.dumps(description)
-            return catalogued(text)
+            return catalogued(json.dumps(description))
     return _built(description, functions_of(name, factory, trust=trust))
 
 

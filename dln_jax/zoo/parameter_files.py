@@ -1,4 +1,6 @@
-"""Parameter trees on disk: tensors as safetensors, metadata as JSON. Reading them never runs code.
+"""Parameter trees on disk, and the uncertainty of a model: tensors as safetensors, metadata as JSON.
+
+Reading them never runs code.
 
 The manifest names its tensor file and stores its SHA-256, so a truncated, swapped or edited file is refused. Both files
 are written beside the old ones and then renamed, the manifest last: a reader sees the old pair or the new.
@@ -7,6 +9,7 @@ are written beside the old ones and then renamed, the manifest last: a reader se
 import hashlib
 import importlib.metadata
 import reprlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
 
@@ -16,12 +19,16 @@ import numpy as np
 import safetensors.numpy
 
 from dln_jax.files import as_type, is_file, read_json, write_bytes, write_json
+from dln_jax.models.uncertainty import Domain, Uncertainty
+from dln_jax.precision import data_type
 from dln_jax.types import InputError
 
 MODEL = "model"
 """Stem of the pair of files in a run folder that holds the trained model."""
 VALUE = "value"
 """Stem of the pair of files in a run folder that holds a value function."""
+UNCERTAINTY = "uncertainty"
+"""Stem of the pair of files with the uncertainty of the model in the same folder."""
 SCHEMA_VERSION = 2
 REMEDY = "restore the file or train again"
 
@@ -74,14 +81,14 @@ def save_tree(directory: Path, name: str, tree: Any, facts: dict[str, Any], *, n
                 old.unlink()
 
 
-def require_fitting(tree: Any, like: Any) -> None:
-    """Raises `InputError` unless a tree has real arrays with the names, shapes and dtypes of another."""
+def require_fitting(tree: Any, like: Any, *, kinds: str = "fiu") -> None:
+    """Raises `InputError` unless a tree has arrays of these kinds, with the names, shapes and dtypes of another."""
     own, expected = _flatten(tree), _flatten(like)
     if different := sorted(set(own) ^ set(expected)):
         state = "unknown" if different[0] in own else "missing"
         raise InputError(f"the parameters are those of another model: '{different[0]:.80}' is {state}")
     for key, array in expected.items():
-        if not isinstance(own[key], np.ndarray | jax.Array | np.generic) or own[key].dtype.kind not in "fiu":
+        if not isinstance(own[key], np.ndarray | jax.Array | np.generic) or own[key].dtype.kind not in kinds:
             raise InputError(f"parameter '{key}' is {reprlib.repr(own[key])}; expected an array of real numbers")
         shape, dtype = np.shape(own[key]), own[key].dtype
         if shape != array.shape or dtype != array.dtype:
@@ -123,19 +130,70 @@ def load_tree(directory: Path, name: str, like: Any) -> Any:
         tensors = safetensors.numpy.load(data)
     except Exception as error:  # the decoder's own errors, and NumPy's for unknown types
         raise InputError(f"{path}: not a safetensors file ({error}); restore it or train again") from error
-    expected = _flatten(like)
-    for key, array in expected.items():
-        if key not in tensors:
-            raise InputError(f"{path}: has no tensor '{key}'; the settings differ from those it was written with")
-        stored = tensors[key]
-        if stored.shape != array.shape or stored.dtype != array.dtype:
-            raise InputError(
-                f"{path}: '{key}' is {stored.dtype} {stored.shape}, expected {array.dtype} {array.shape}; "
-                "load it with the settings and precision it was written with"
-            )
+    try:
+        require_fitting(tensors, like, kinds="fiub")
+    except InputError as error:
+        raise InputError(f"{path}: {error}; load it with the settings and precision it was written with") from None
     # Copies, because arrays that share the file's bytes could not be donated.
-    leaves = [jax.numpy.array(tensors[key]) for key in expected]
+    leaves = [jax.numpy.array(tensors[key]) for key in _flatten(like)]
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+def save_uncertainty(directory: str | Path, uncertainty: Uncertainty, **facts: Any) -> None:
+    """Stores the uncertainty of the model in a run's folder, in the precision of the model.
+
+    Args:
+        uncertainty: uncertainty of the model's parameters, from `learning.uncertainty.estimate`.
+        facts: JSON values on how it was estimated.
+
+    Raises:
+        InputError: the folder has no model, or the number of parameters differs.
+    """
+    directory = Path(directory)
+    manifest = load_manifest(directory, MODEL)
+    P, own = sum(int(np.prod(tensor["shape"])) for tensor in manifest["tensors"].values()), len(uncertainty.factor)
+    if own != P:
+        raise InputError(
+            f"the uncertainty is of {own} parameters, and the model in {directory} has {P}; estimate it of that model"
+        )
+    dtype = data_type(str(manifest["model"]["precision"]))
+    stored = jax.tree.map(lambda leaf: np.asarray(leaf, dtype), uncertainty)
+    save_tree(directory, UNCERTAINTY, stored, {"of": manifest["sha256"], "facts": facts})
+
+
+def load_uncertainty(directory: Path) -> Uncertainty | None:
+    """Loads the uncertainty stored beside a run's model; `None` if there is none.
+
+    Raises:
+        InputError: it is damaged, or belongs to other parameters than the model's.
+    """
+    path = directory / f"{UNCERTAINTY}.json"
+    if not is_file(path):
+        return None
+    manifest, of = load_manifest(directory, UNCERTAINTY), load_manifest(directory, MODEL)
+    if manifest.get("of") != of.get("sha256"):
+        raise InputError(f"{path}: belongs to other parameters than the model's; delete it, {REMEDY}")
+    try:
+        stated = {key: tuple(tensor["shape"]) for key, tensor in manifest["tensors"].items()}
+        (P, K), (d,), u = stated["factor"], stated["noise"], stated["domain/undetermined"][1]
+        dtype = data_type(str(of["model"]["precision"]))
+    except (KeyError, TypeError, ValueError, IndexError):
+        raise InputError(f"{path}: does not state its arrays; {REMEDY}") from None
+    domain = Domain((d,), (P,), (P, u), (3 * d,), (3 * d,), (d,))
+    shapes = Uncertainty((P, K), (d,), (d,), domain)
+    like = jax.tree.map(
+        lambda shape: jax.ShapeDtypeStruct(shape, dtype),
+        shapes,
+        is_leaf=lambda leaf: type(leaf) is tuple,
+    )
+    return load_tree(directory, UNCERTAINTY, like)
+
+
+def discard_uncertainty(directory: Path) -> None:
+    """Removes the stored uncertainty, if any."""
+    for ending in ("json", "safetensors"):
+        with suppress(OSError):
+            (directory / f"{UNCERTAINTY}.{ending}").unlink(missing_ok=True)
 
 
 def _flatten(tree: Any) -> dict[str, Any]:

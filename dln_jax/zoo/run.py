@@ -22,8 +22,17 @@ from dln_jax.models.uncertainty import Uncertainty, predictive
 from dln_jax.precision import data_type, require_double_precision
 from dln_jax.types import InputError, VectorLike
 from dln_jax.zoo.descriptions import OWN, Description, build
-from dln_jax.zoo.parameter_files import MODEL, REMEDY, VALUE, load_manifest, load_tree, require_fitting, save_tree
-from dln_jax.zoo.uncertainty_files import discard_uncertainty, load_uncertainty
+from dln_jax.zoo.parameter_files import (
+    MODEL,
+    REMEDY,
+    VALUE,
+    discard_uncertainty,
+    load_manifest,
+    load_tree,
+    load_uncertainty,
+    require_fitting,
+    save_tree,
+)
 
 if TYPE_CHECKING:
     from dln_jax.zoo.value_functions import ValueRun
@@ -68,16 +77,12 @@ class Run:
     @functools.cached_property
     def dynamics(self) -> Dynamics | PlainDynamics:
         """Functions of coordinates and velocities. Raises InputError for a model that has none."""
-        if isinstance(self.energies, PhaseRates):
-            raise self._refusal("dynamics")
-        return compiled(equations.dynamics(self.energies, degrees_of_freedom=self._degrees_of_freedom), self.dtype)
+        return self._compiled("dynamics", equations.dynamics, PhaseRates)
 
     @functools.cached_property
     def flow(self) -> Flow | PlainFlow:
         """Functions of coordinates and momenta, without applied forces. Raises InputError for a model that has none."""
-        if isinstance(self.energies, InverseForward):
-            raise self._refusal("flow")
-        return compiled(equations.flow(self.energies, degrees_of_freedom=self._degrees_of_freedom), self.dtype)
+        return self._compiled("flow", equations.flow, InverseForward)
 
     @functools.cached_property
     def derivatives(self) -> Callable[[VectorLike], Derivatives]:
@@ -125,10 +130,13 @@ class Run:
         """Floating-point type of the training."""
         return data_type(self.description["precision"])
 
-    @property
-    def _degrees_of_freedom(self) -> int | None:
+    def _compiled(self, asked: str, functions_of: Callable[..., Any], other: type) -> Any:
+        """Functions of the energies, unless these are of the other kind."""
+        if isinstance(self.energies, other):
+            raise self._refusal(asked)
         needs = self.description.get("needs")
-        return None if needs is None else len(needs["joints"])
+        d = None if needs is None else len(needs["joints"])
+        return compiled(functions_of(self.energies, degrees_of_freedom=d), self.dtype)
 
     def _of(self, asked: str, kind: type) -> Any:
         if not isinstance(self.model, kind):

@@ -19,9 +19,9 @@ from dln_jax.files import as_type, is_file, read_json, write_bytes, write_json
 from dln_jax.metrics.report import Row, conditions, write_report
 from dln_jax.precision import in_float64
 from dln_jax.runs.arguments import names_listed
+from dln_jax.runs.folder import command_folder
 from dln_jax.runs.options import Resumable
 from dln_jax.runs.running import run
-from dln_jax.runs.stored_arguments import command_folder
 from dln_jax.types import InputError
 
 JOBS = "jobs.json"

@@ -29,8 +29,7 @@ from dln_jax.files import write_json
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.problem import Progress
 from dln_jax.runs.arguments import arguments_of
-from dln_jax.runs.stored_arguments import stored_arguments
-from dln_jax.zoo.run_folder import CONFIG, LOCK
+from dln_jax.runs.folder import CONFIG, LOCK, stored_arguments
 
 TRAJECTORIES = small_log(2)
 MESH = {"vertices": np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), "elements": np.array([[0, 1, 2]])}

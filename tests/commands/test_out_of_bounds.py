@@ -30,7 +30,7 @@ from dln_jax.commands import (
 )
 from dln_jax.data import schema
 from dln_jax.runs.arguments import arguments_of
-from dln_jax.runs.stored_arguments import with_stored_arguments, write_config
+from dln_jax.runs.folder import with_stored_arguments, write_config
 from dln_jax.zoo.run import load
 from dln_jax.zoo.value_functions import network_of, plant_named, save_value
 

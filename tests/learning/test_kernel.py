@@ -12,7 +12,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.kernel import States
 from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.pendulums import pendulum, two_link_arm
-from dln_jax.zoo.catalogue import CATALOGUE
+from dln_jax.zoo.descriptions import make
 
 COEFFICIENTS = {"viscous": [0.3, 0.1], "coulomb": [0.2, 0.4], "offset": [0.1, -0.05]}
 
@@ -32,7 +32,7 @@ def arm():
 def test_torques_and_friction_are_found_where_the_basis_is_exact(arm):
     train, test = arm
     fit = fit_kernel(train.needs, train, likelihood_samples=30, iterations=20, least_noise=1e-6)
-    model = CATALOGUE["trigonometric-kernel"].make(needs=train.needs, samples=fit.samples)
+    model = make("trigonometric-kernel", train.needs, samples=fit.samples)
     torque = jax.jit(jax.vmap(dynamics(model.energies(fit.parameters)).inverse_dynamics))
     tau = torque(test.q, test.qd, test.qdd)
     np.testing.assert_allclose(tau, test.tau, rtol=0, atol=1e-3 * abs(test.tau).max())
@@ -63,7 +63,7 @@ def test_what_makes_no_kernel_is_refused(arm):
         (lambda: fit_kernel(train.needs._replace(joint_friction=("load",)), train), "leave load out"),
         (lambda: fit_kernel(pendulum().needs, train), "the needs have 1 joints, the data 2"),
         (lambda: fit_kernel(train.needs, train, least_noise=0.0), "least_noise is 0"),
-        (lambda: CATALOGUE["trigonometric-kernel"].make(needs=train.needs, samples=0), "samples is 0; expected a pos"),
+        (lambda: make("trigonometric-kernel", train.needs, samples=0), "samples is 0; expected a pos"),
     ]:
         with one_line(message):
             call()

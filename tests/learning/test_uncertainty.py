@@ -13,7 +13,7 @@ from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.posterior import leading_directions, posterior, spectrum
 from dln_jax.learning.uncertainty import calibration, effective_samples, estimate, scatter
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.coverage import coverage
+from dln_jax.metrics.errors import coverage
 from dln_jax.models.model import linearised
 from dln_jax.models.trees import make_rigid_tree
 from dln_jax.models.uncertainty import out_of_distribution, predictive, scores
@@ -67,7 +67,7 @@ def test_bands_cover_what_they_promise(fitted):
     motion = jax.jit(jax.vmap(dynamics(ARM.energies(parameters)).inverse_dynamics))
     test = drawn(10, samples=2000)
     state = test.q, test.qd, test.qdd
-    shares = coverage(motion(*state) - test.tau, std(*state), levels=(0.5, 0.95)).shares
+    shares = coverage(motion(*state) - test.tau, std(*state), levels=(0.5, 0.95))
     np.testing.assert_allclose(shares, [[0.5, 0.5], [0.95, 0.95]], atol=0.04)
 
 

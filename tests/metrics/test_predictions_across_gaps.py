@@ -7,7 +7,7 @@ from calls import one_line
 
 from dln_jax import HamiltonianSystem, Model
 from dln_jax.data import schema
-from dln_jax.metrics.motions import (
+from dln_jax.metrics.predictions import (
     cut_recordings,
     grid_places,
     predict_measured,

@@ -76,7 +76,7 @@ def test_energy_is_the_work_of_the_torque_less_friction():
     """A damped oscillator from rest under a held torque: the work is ∫ qd (tau - friction qd) dt."""
     system = damped_oscillator()
     t, tau = jnp.linspace(0.0, 2.0, 41), jnp.full((41, 1), 1.5)
-    motion = jax.jit(lambda: follow(system, jnp.zeros(1), jnp.zeros(1), tau, t))()
+    motion = jax.jit(lambda: follow(system, jnp.zeros(1), jnp.zeros(1), tau, jnp.zeros((40, 1)), t))()
     frequency = np.sqrt(8 - FRICTION**2 / 4)
     qd = 1.5 / frequency * np.exp(-FRICTION / 2 * t) * np.sin(frequency * t)
     assert_allclose(motion.qd[:, 0], qd, atol=1e-9)
@@ -86,7 +86,7 @@ def test_energy_is_the_work_of_the_torque_less_friction():
 
 
 def test_valid_prediction_time_is_the_first_time_over_the_threshold():
-    """Errors relative to variances 4 and 100: an offset of 0.5 in both makes 0.065, one of 0.49 makes 0.0624."""
+    """Errors relative to 6.45 times variances 4 and 100: an offset of 0.5 in both makes 0.0101, one of 0.49 0.0097."""
     q, t = np.linspace(0, 1, 10).reshape(5, 2), np.arange(5) * 0.5 + 3.0
     for offset, seconds in (
         ([0, 0.3, 0.4, 0.49, 0.49], 2.0),
@@ -98,17 +98,17 @@ def test_valid_prediction_time_is_the_first_time_over_the_threshold():
         ([0, 1e200, 0, 0, 0], 0.5),
     ):
         q_hat = q + np.array(offset)[:, None]
-        assert valid_prediction_time(q, q_hat, t, np.array([4.0, 100.0]), threshold=0.0645) == seconds
+        assert valid_prediction_time(q, q_hat, t, 6.45 * np.array([4.0, 100.0])) == seconds
 
 
 def test_prediction_metrics_follow_their_definitions():
     data = recordings()
     groups = slice(0, 5), slice(5, 8)
-    motions = [Motion(data.q[group] + 0.1, data.qd[group] - 0.2, np.zeros(len(data.q[group]))) for group in groups]
-    motions[0].q[:2] -= 0.1
+    motions = [Motion(data.q[group] + 1.0, data.qd[group] - 0.2, np.zeros(len(data.q[group]))) for group in groups]
+    motions[0].q[:2] -= 1.0
     variance = np.var(data.q)
-    assert_allclose(valid_prediction_times(data, motions, threshold=0.009 / variance), [0.3, 0.0])
-    expected = np.sqrt((6 / 8 * 0.01 / variance + 0.04 / np.var(data.qd)) / 2)
+    assert_allclose(valid_prediction_times(data, motions), [0.3, 0.0])
+    expected = np.sqrt((6 / 8 / variance + 0.04 / np.var(data.qd)) / 2)
     assert normalised_state_error(data, motions) == pytest.approx(expected, rel=1e-12)
     motions[1].qd[0] = np.nan
     assert normalised_state_error(data, motions) == np.inf

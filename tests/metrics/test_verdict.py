@@ -5,8 +5,8 @@ import pytest
 from calls import one_line
 
 from dln_jax.errors import FitRefused
-from dln_jax.metrics.coverage import LEVELS as PROBABILITIES
-from dln_jax.metrics.coverage import coverage, half_width
+from dln_jax.metrics.errors import LEVELS as PROBABILITIES
+from dln_jax.metrics.errors import coverage, half_width
 from dln_jax.metrics.verdict import LEVELS, HeldOut, Verdict, held_out, judge, verdict_metrics, worst
 
 RANDOM = np.random.default_rng(3)
@@ -131,7 +131,7 @@ def test_bands_of_a_normal_variable_hold_what_they_say():
     random = np.random.default_rng(0)
     std = random.uniform(0.5, 2.0, (20_000, 2))
     covered = coverage(std * random.normal(size=std.shape), std)
-    np.testing.assert_allclose(covered.shares, np.tile(PROBABILITIES, (2, 1)).T, atol=0.015)
+    np.testing.assert_allclose(covered, np.tile(PROBABILITIES, (2, 1)).T, atol=0.015)
     assert half_width(0.95) == pytest.approx(1.959964, abs=1e-6)
     for wrong, levels, words in (
         (std[:, :1], (0.5,), "expected the same"),

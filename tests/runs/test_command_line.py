@@ -21,9 +21,9 @@ from dln_jax.commands import COMMANDS
 from dln_jax.errors import FitRefused
 from dln_jax.metrics.verdict import Verdict
 from dln_jax.options import Unstated, choice
+from dln_jax.runs.folder import CONFIG, run_folder
 from dln_jax.runs.progress import progress
 from dln_jax.runs.running import run
-from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 ROOT = Path(__file__).parents[2]
 

@@ -23,9 +23,9 @@ class Arguments:
     """Size of the vector."""
 
 def main(given):
-    before = compilation_cache.compilation()
+    before = compilation_cache.compilation()["cached"]
     jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones(given.size))
-    print("found", compilation_cache.compilation().cached - before.cached)
+    print("found", compilation_cache.compilation()["cached"] - before)
 
 running.run(main, Arguments, prog="tiny", began=0.0)
 '''

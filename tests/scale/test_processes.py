@@ -24,7 +24,7 @@ import numpy as np
 from dln_jax.runs.options import Resumable, Scaled
 from dln_jax.runs.progress import progress
 from dln_jax.runs.running import run
-from dln_jax.runs.stored_arguments import command_folder
+from dln_jax.runs.folder import command_folder
 from dln_jax.runs.scaled import mesh_of
 from dln_jax.scale import of_first_process, shard, spread
 from dln_jax.types import InputError

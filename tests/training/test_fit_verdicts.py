@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax import LagrangianSystem, Needs, dynamics
+from dln_jax import LagrangianSystem, Needs
 from dln_jax.data.log import Log
 from dln_jax.data.parts import Parts
 from dln_jax.data.schema import from_arrays
@@ -12,7 +12,7 @@ from dln_jax.learning.fit import Fit
 from dln_jax.learning.objectives import CANONICAL, STATED
 from dln_jax.metrics.motions import Motion
 from dln_jax.models.model import Model
-from dln_jax.runs.evaluation import verdict_of as verdict_and_metrics
+from dln_jax.runs.verdict import verdict_of as verdict_and_metrics
 
 N = 300
 OBJECTIVES = {**STATED, "momenta": CANONICAL}
@@ -30,9 +30,10 @@ def verdict_of(inertia=lambda q: jnp.ones(()), *, objective="inverse", motions=(
     """The verdict on a model with this inertia, whose answers are exact but for the changes."""
     log = Log("log", DATA, Needs(joints=("revolute",)), "the test", faults=causes)
     system = LagrangianSystem(lambda q, qd: inertia(q[0]) * qd[0] ** 2 / 2)
-    model, description = Model(lambda key: (), lambda parameters: system), {"name": "black-box-delan"}
+    model = Model(lambda key: (), lambda parameters: system)
+    description = {"name": "black-box-delan", "precision": "f64"}
     fit = Fit(model, (), description, objective=OBJECTIVES[objective])
-    verdict, metrics = verdict_and_metrics(fit, dynamics(system), Parts(SETS), log, ANSWERS | changes, list(motions))
+    verdict, metrics = verdict_and_metrics(fit, Parts(SETS), log, ANSWERS | changes, list(motions))
     assert metrics["verdict"] == verdict.number and {"test_nmse", "validation_nmse"} <= set(metrics)
     return verdict
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from dln_jax.commands.identification.verdict import friction_verdict, spikes, weight_verdict
 from dln_jax.metrics.verdict import HeldOut
-from dln_jax.runs.evaluation import verdict_on_search
+from dln_jax.runs.verdict import verdict_on_search
 
 
 def test_learned_tree_says_how_its_frames_were_found():

@@ -66,7 +66,7 @@ OF_DELAN = {
     '{"name": "os:system"}': "",
     '{"name": "own"}': "",
     '{"width": 6}': "expected float32",
-    '{"depth": 3}': "no tensor|expected float32",
+    '{"depth": 3}': "is missing|expected float32",
     '{"precision": "f16"}': "precision",
     '{"precision": ["f64"]}': "",
     '{"activation": ["tanh"]}': "",

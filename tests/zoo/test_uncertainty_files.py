@@ -13,8 +13,8 @@ from dln_jax import Needs, build, describe, load_c
 from dln_jax.export.c.families import functions_of_run
 from dln_jax.export.c.run import export_run
 from dln_jax.models.uncertainty import Domain, Uncertainty, out_of_distribution, predictive
+from dln_jax.zoo.parameter_files import save_uncertainty
 from dln_jax.zoo.run import load, save
-from dln_jax.zoo.uncertainty_files import save_uncertainty
 
 NEEDS = Needs(joints=("revolute", "prismatic"), friction=True)
 DESCRIPTION = describe("structured-delan", needs=NEEDS, precision="f64", width=3, depth=1)

@@ -19,7 +19,7 @@ from dln_jax.identification import equations
 from dln_jax.identification.identify import Identification, identify, parameters_of
 from dln_jax.identification.motions import REWEIGHTINGS, MotionFit, cut_motions, fit_motions
 from dln_jax.learning.shooting import MeasuredWindows
-from dln_jax.metrics.motions import cut_segments, predict_measured, valid_times
+from dln_jax.metrics.predictions import cut_segments, predict_measured, valid_times
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError
 
@@ -126,15 +126,14 @@ def choose_window(
         rest = np.delete(present, slice(fold, None, FOLDS))
         inner, moved, held = select(train, rest), select(motions, rest), select(motions, present[fold::FOLDS])
         solution = identify(model, known, inner, **options)
-        thetas: dict[float | None, np.ndarray] = {None: solution.theta}
-        for window in [window for window in WINDOWS if window in times]:
+        for window in list(times):
             try:
-                thetas[window] = refit(by, model, known, solution, inner, moved, window, reweightings=0)[0].theta
+                theta = refit(by, model, known, solution, inner, moved, window, reweightings=0)[0].theta
             except InputError as error:
                 del times[window]
                 reason = f"; other lengths were left out: {error}"
-        for window, theta in thetas.items():
-            times[window].append(prediction_times(model, parameters_of(theta, known), held, variance)[0])
+            else:
+                times[window].append(prediction_times(model, parameters_of(theta, known), held, variance)[0])
     means = {window: float(np.mean(np.concatenate(parts))) for window, parts in times.items()}
     best = max(means, key=lambda window: means[window])
     names = {window: "torques" if window is None else f"{window:g} s" for window in means}
@@ -168,3 +167,19 @@ def prediction_times(
     padded = MeasuredWindows(*(array[rows] for array in segments))
     predicted = predict_measured(model, parameters, padded, fitted=fitted)
     return valid_times(padded, predicted, fitted=fitted, variance=variance)[:count], (samples - fitted) * step
+
+
+def motion_lines(by: str, fit: MotionFit | None, times: dict[str, float | int]) -> list[str]:
+    """Lines on the fit to motions, if there is one, and on predictions of held-out motions."""
+    line = (
+        f"held-out motions: predicted for {times['vpt_seconds']:.3g} s of {times['predicted_seconds']:.3g} s, by "
+        f"torques alone for {times['by_torques_vpt_seconds']:.3g} s (mean valid prediction time)"
+    )
+    if fit is None:
+        return [line]
+    lines = [
+        f"by {by}: windows are off by {fit.after:.3g} of their noise (before: {fit.before:.3g}; {fit.rounds} rounds)",
+        line,
+        f"motions follow the logged torques by {1e3 * fit.delay:.1f} ms; the model has no delay",
+    ]
+    return lines if fit.converged else [*lines, "the fit to motions did not converge; record motions closer to the use"]

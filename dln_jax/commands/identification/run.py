@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import jax
 import numpy as np
@@ -12,23 +12,21 @@ from jax import Array
 from dln_jax.commands.identification.motions import (
     choose_window,
     lightly_filtered,
+    motion_lines,
     prediction_times,
     refit,
     spread_of,
 )
 from dln_jax.commands.identification.verdict import Predict, judge_robot
 from dln_jax.commands.identify import LAWS, NO_FRICTION, TEMPERATURE, Arguments
-from dln_jax.data.encoders.sampling import torque_noise
 from dln_jax.data.log import SPLIT, read_log
 from dln_jax.data.parts import Parts, split_log
 from dln_jax.data.robot_files import write_robot
 from dln_jax.data.robots import Robot, read_robot
-from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, is_cut
 from dln_jax.figures.torques import friction_curves, torque_by_joint
 from dln_jax.files import write_bytes, write_json
 from dln_jax.identification.identify import base_rows, findings, identify, parameter_rows, parameters_of, summary, text
-from dln_jax.identification.motions import MotionFit
 from dln_jax.identification.residual import inner_split
 from dln_jax.identification.rigid_tree import at_reference, build_rigid_tree, describe_rigid_tree
 from dln_jax.learning.fit import Fit, with_uncertainty
@@ -36,21 +34,20 @@ from dln_jax.learning.friction import reference_temperature
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import require_laws, shape_of
 from dln_jax.mechanics.trees.motors import Pair, armature_matrix, require_motors
-from dln_jax.metrics.errors import normalised_error
+from dln_jax.metrics.errors import mean_square, normalised_error
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.trees import RigidTreeParameters, Rows, pairs_of
-from dln_jax.precision import quick_compilation
 from dln_jax.runs.arguments import (
+    facts,
     names_in,
     names_listed,
     numbers_of,
     refuse_given,
     require_positive_if_given,
 )
-from dln_jax.runs.evaluation import bands_of
-from dln_jax.runs.logs import facts
+from dln_jax.runs.evaluation import bands_of, compiled
+from dln_jax.runs.folder import command_folder
 from dln_jax.runs.report import Report, finish, png
-from dln_jax.runs.stored_arguments import command_folder
 from dln_jax.types import FrictionLaw, InputError
 from dln_jax.zoo.descriptions import Description
 
@@ -76,6 +73,7 @@ def run(options: Arguments) -> None:
     of_file = {"needs": robot.tree.needs, "needs_origin": "the robot's file", "settled": SETTLED, "more": more}
     log = read_log(options.data, robot=robot, **of_file, **facts(options))
     robot = log.robot or robot
+    log = log._replace(robot=robot)
     tree, names = robot.tree, robot.tree.names
     motors, coupled = stated_motors(options, tree.degrees_of_freedom)
     if cooling:
@@ -84,10 +82,9 @@ def run(options: Arguments) -> None:
     train, test = parts.sets.train, parts.sets.test
     logs = [train, test]
     if options.by != "torques" and log.measured is not None:
-        light = split_log(
-            log._replace(data=lightly_filtered(log.measured, log.smoothed)), options.test, validation=False
-        ).sets
-        logs += [light.train, light.test]
+        light = log._replace(data=lightly_filtered(log.measured, log.smoothed))
+        lighter = split_log(light, options.test, validation=False).sets
+        logs += [lighter.train, lighter.test]
 
     with command_folder(options, "identify") as folder:
         whole_blocks = parts.blocks and not is_cut(options.test)
@@ -145,27 +142,21 @@ def run(options: Arguments) -> None:
         }
         for name, error in errors.items():
             prefix = "" if name == FITTED else f"{name}_"
-            metrics[f"{prefix}torque_mse"] = float(np.mean(np.sum((torques[name] - test.tau) ** 2, axis=1)))
+            metrics[f"{prefix}torque_mse"] = mean_square(torques[name] - test.tau)
             metrics[f"{prefix}nmse"] = float(np.nanmean(error))
             metrics |= {f"{prefix}nmse_joint_{k + 1}": float(value) for k, value in enumerate(error)}
         metrics |= {f"noise_joint_{k + 1}": float(value) for k, value in enumerate(solution.fit.noise)}
         if solution.consistent is not None:
             metrics["consistent_iterations"] = solution.consistent.iterations
-        times: dict[str, float] = {}
         if motions:
+            variance = spread_of(*motions)
             for name, theta in {"vpt_seconds": solution.theta, "by_torques_vpt_seconds": by_torques}.items():
-                tried = parameters_of(theta, known)
-                predicted_times, times["predicted_seconds"] = prediction_times(
-                    model, tried, motions[1], spread_of(*motions)
-                )
-                times[name] = float(np.mean(predicted_times))
-            of_motions += motion_lines(options.by, by_motions, times)
-        whole = False
+                times, length = prediction_times(model, parameters_of(theta, known), motions[1], variance)
+                metrics |= {"predicted_seconds": length, name: float(np.mean(times))}
+            of_motions += motion_lines(options.by, by_motions, metrics)
         if by_motions is not None:
-            times |= {"delay_seconds": by_motions.delay, "rounds": by_motions.rounds}
-            times |= {"motion_rms_before": by_motions.before, "motion_rms": by_motions.after}
-            whole = bool(np.isclose(times["vpt_seconds"], times["predicted_seconds"]))
-        metrics |= times
+            metrics |= {"delay_seconds": by_motions.delay, "rounds": by_motions.rounds}
+            metrics |= {"motion_rms_before": by_motions.before, "motion_rms": by_motions.after}
         verdict, of_verdict = judge_robot(
             solution,
             known,
@@ -174,11 +165,9 @@ def run(options: Arguments) -> None:
             train,
             test,
             torques,
-            names,
-            noise=torque_noise(train) if log.torque_noise is None else log.torque_noise,
-            causes=log.faults,
+            log,
             robust=options.robust,
-            whole=whole,
+            whole=by_motions is not None and bool(np.isclose(metrics["vpt_seconds"], metrics["predicted_seconds"])),
         )
         metrics |= of_verdict
 
@@ -187,7 +176,19 @@ def run(options: Arguments) -> None:
         if options.figures:
             figures["torque.png"] = png(torque_by_joint, test, torques[FITTED], names, units)
             if description["needs"]["joint_friction"]:
-                figures["friction.png"] = friction_figure(predict, parameters, test, *predicted[FITTED], names, units)
+                # All joints at once, each over its own range: friction in a joint does not depend on the others.
+                rates = np.linspace(test.qd.min(axis=0), test.qd.max(axis=0), len(test.t))
+                still = np.zeros_like(rates)
+                curves = predict(parameters, test._replace(q=still, qd=rates, qdd=still))[1]
+                torque, friction = predicted[FITTED]
+                figures["friction.png"] = png(
+                    friction_curves,
+                    {"identified": (rates, curves)},
+                    names=names,
+                    force_unit=units,
+                    measured=(test.qd, test.tau - (torque - friction)),
+                    rate_unit=["rad/s" if unit == "N m" else "m/s" for unit in units],
+                )
         if options.uncertainty:
             try:
                 inner = Parts(Split(*inner_split(train), test))
@@ -249,36 +250,18 @@ def stated_motors(options: Arguments, d: int) -> tuple[Rows | None, tuple[Pair, 
     if options.motors is not None:
         rows = tuple(numbers_of("--motors", row, [d]) for row in options.motors.split(";"))
         if len(rows) != d:
-            raise InputError(
-                f"--motors has {len(rows)} rows; expected {d}, one for each motor, separated by semicolons"
-            )
+            raise InputError(f"--motors has {len(rows)} rows; expected {d}, one per motor, separated by semicolons")
     for pair in names_listed(options.coupled):
-        joints = pair.partition(":")[::2]
-        if not all(joint.strip().isdecimal() for joint in joints):
-            raise InputError(f"--coupled has {pair!r:.40}; expected pairs of joints such as 2:3")
-        first, second = sorted(int(joint) - 1 for joint in joints)
+        try:
+            first, second = sorted(int(joint) - 1 for joint in pair.split(":"))
+        except ValueError:
+            raise InputError(f"--coupled has {pair!r:.40}; expected pairs of joints such as 2:3") from None
         pairs.append((first, second))
     try:
         require_motors(rows, pairs, d)
     except InputError as error:
         raise InputError(f"--{error}") from None
     return rows, tuple(pairs)
-
-
-def motion_lines(by: str, fit: MotionFit | None, times: dict[str, float]) -> list[str]:
-    """Lines on the fit to motions, if there is one, and on predictions of held-out motions."""
-    line = (
-        f"held-out motions: predicted for {times['vpt_seconds']:.3g} s of {times['predicted_seconds']:.3g} s, by "
-        f"torques alone for {times['by_torques_vpt_seconds']:.3g} s (mean valid prediction time)"
-    )
-    if fit is None:
-        return [line]
-    lines = [
-        f"by {by}: windows are off by {fit.after:.3g} of their noise (before: {fit.before:.3g}; {fit.rounds} rounds)",
-        line,
-        f"motions follow the logged torques by {1e3 * fit.delay:.1f} ms; the model has no delay",
-    ]
-    return lines if fit.converged else [*lines, "the fit to motions did not converge; record motions closer to the use"]
 
 
 def predictor(model: Model) -> Predict:
@@ -288,39 +271,8 @@ def predictor(model: Model) -> Predict:
         motion = dynamics(model.energies(parameters))
         return motion.inverse_dynamics(q, qd, qdd), motion.friction(q, qd)
 
-    every = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
-
-    def predict(parameters: Parameters, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
-        torque, friction = every(parameters, data.q, data.qd, data.qdd)
-        return np.asarray(torque), np.asarray(friction)
-
-    return predict
-
-
-def friction_figure(
-    predict: Predict,
-    parameters: Parameters,
-    test: Trajectories,
-    torque: np.ndarray,
-    friction: np.ndarray,
-    names: tuple[str, ...],
-    units: list[str],
-) -> Callable[[Path], None]:
-    """Figure of friction over rates: the identified curves, and what the rest of the model leaves of the torques.
-
-    All joints are evaluated at once, each over its own range: friction in a joint does not depend on the others.
-    """
-    rates = np.linspace(test.qd.min(axis=0), test.qd.max(axis=0), len(test.t))
-    still = np.zeros_like(rates)
-    curves = predict(parameters, test._replace(q=still, qd=rates, qdd=still))[1]
-    return png(
-        friction_curves,
-        {"identified": (rates, curves)},
-        names=names,
-        force_unit=units,
-        measured=(test.qd, test.tau - (torque - friction)),
-        rate_unit=["rad/s" if unit == "N m" else "m/s" for unit in units],
-    )
+    every = compiled(jax.vmap(one, in_axes=(None, 0, 0, 0)))
+    return lambda parameters, data: jax.tree.map(np.asarray, every(parameters, data.q, data.qd, data.qdd))
 
 
 def shape_lines(description: Description) -> list[str]:
@@ -342,20 +294,24 @@ def write_identified(
     armature = armature_matrix(parameters.armature, motors, pairs_of(parameters.coupling))
     tree = robot.tree._replace(inertias=np.asarray(parameters.inertias), armature=np.asarray(armature))
     remarks = [f"Identified from {options.data.name}."]
-    coefficients = {
-        name: np.asarray(values)
-        for name, values in parameters._asdict().items()
-        if values is not None and name not in ("inertias", "armature", "coupling")
-    }
-    friction: dict[str, Any] = {"damping": coefficients.pop("viscous", None)}
-    friction["coulomb"] = coefficients.pop("coulomb", None)
+    named = parameters.friction._asdict().items()
+    coefficients = {name: np.asarray(values) for name, values in named if values is not None}
+    damping, coulomb = (coefficients.pop(name, None) for name in ("viscous", "coulomb"))
     for name, values in coefficients.items():
         pairs = ", ".join(f"{joint} {value!r}" for joint, value in zip(tree.names, values.tolist(), strict=True))
         remarks.append(f"Friction that the file cannot state, {name}: {pairs}.")
     remarks += [f"Not in this file: {line}." for line in shape_lines(description) if line.startswith(("load", "cool"))]
-    locked = names_listed(options.lock)
     try:
-        write_robot(path, options.robot, tree, **friction, motors=motors, lock=locked, remarks=tuple(remarks))
+        write_robot(
+            path,
+            options.robot,
+            tree,
+            damping=damping,
+            coulomb=coulomb,
+            motors=motors,
+            lock=names_listed(options.lock),
+            remarks=tuple(remarks),
+        )
     except InputError as error:
         return f"no {path.name}: {error}"
     lacks = " without armature, which URDF cannot state (a comment in the file has it)" * (path.suffix == ".urdf")

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from dln_jax.data.encoders.sampling import torque_noise
+from dln_jax.data.log import Log
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import every
 from dln_jax.identification.identify import Identification, parameters_of
@@ -14,7 +16,6 @@ from dln_jax.identification.rigid_tree import MOST, shared_motor
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.metrics.verdict import WORSE, Verdict, held_out, judge, verdict_metrics, worst
 from dln_jax.models.model import Parameters
-from dln_jax.models.trees import RigidTreeParameters
 from dln_jax.zoo.descriptions import Description
 
 HEAVIER, MUCH_HEAVIER = 5.0, 50.0
@@ -47,10 +48,8 @@ def judge_robot(
     train: Trajectories,
     test: Trajectories,
     torques: dict[str, np.ndarray],
-    names: tuple[str, ...],
+    log: Log,
     *,
-    noise: np.ndarray | None,
-    causes: tuple[str, ...],
     robust: bool,
     whole: bool,
 ) -> tuple[Verdict, dict[str, float | int]]:
@@ -59,12 +58,13 @@ def judge_robot(
     Args:
         known: parameters in the robot's file.
         torques: torques on the held-out motions [N, d], by "file", "least_squares" and "identified".
-        noise: standard deviation of the torques' noise [d].
-        causes: faults of the log that no filter repairs.
+        log: the log with its robot; its faults count, and the noise of its torques is estimated if it states none.
         robust: whether spikes in held-out samples are ignored.
         whole: whether a fit to motions predicts the held-out ones to their ends.
     """
-    fitted, d = torques["identified"], test.degrees_of_freedom
+    assert log.robot is not None
+    names, fitted, d = log.robot.tree.names, torques["identified"], test.degrees_of_freedom
+    noise = torque_noise(train) if log.torque_noise is None else log.torque_noise
     rows = ~spikes(test.tau).any(axis=1) if robust else np.ones(len(test.t), bool)
     errors = held_out(fitted[rows], test.tau[rows], noise=noise, file=torques["file"][rows])
     by_torques = judge(errors, names)
@@ -76,13 +76,14 @@ def judge_robot(
     friction = predict(mine, test._replace(q=still, qdd=still))[1]
     scales = description["velocity_scale"]
     stated = not isinstance(scales, list) or not {"coulomb", "stribeck"} & set(description["needs"]["joint_friction"])
-    bodies = [predict(without_joints(theta), test)[0] for theta in (mine, known)]
+    alone = (jax.tree.map(jnp.zeros_like, theta)._replace(inertias=theta.inertias) for theta in (mine, known))
+    bodies = [predict(theta, test)[0] for theta in alone]
     verdict = worst(
         by_torques,
         consistent_verdict(solution, fitted, torques["least_squares"], test.tau),
         friction_verdict(names, test.qd, test.tau, friction, None if stated else np.array(scales)),
         weight_verdict(*bodies),
-        causes=causes,
+        causes=log.faults,
     )
     if verdict.level != "good" and description["motors"] is None:
         thin = every(train, -(-len(train.t) // MOST))
@@ -147,11 +148,6 @@ def friction_verdict(
             reason = f"{names[k]} hardly reaches {scales[k]:.3g}/s, the velocity scale of its dry friction"
             every.append(Verdict("doubtful", reason, "state it (--velocity-scale 0.05), or record faster motions"))
     return worst(*every)
-
-
-def without_joints(parameters: RigidTreeParameters) -> RigidTreeParameters:
-    """Parameters of the bodies alone, without armature and friction."""
-    return jax.tree.map(jnp.zeros_like, parameters)._replace(inertias=parameters.inertias)
 
 
 def weight_verdict(mine: Float[np.ndarray, "N d"], file: Float[np.ndarray, "N d"]) -> Verdict:

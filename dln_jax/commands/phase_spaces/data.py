@@ -31,8 +31,8 @@ from dln_jax.data.splits import (
     with_joints,
 )
 from dln_jax.learning.shooting import MeasuredWindows, Noise, Weights
-from dln_jax.metrics.motions import cut_recordings, grid_places
 from dln_jax.metrics.phase_space import Motions
+from dln_jax.metrics.predictions import cut_recordings, grid_places
 from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS, PhaseSamples, reference_motion
 from dln_jax.types import Hamiltonian, InputError, Needs
 

@@ -14,7 +14,6 @@ from dln_jax.figures.phase_space import Field, motion_figure, write_motion_gif
 from dln_jax.figures.style import TRUTH
 from dln_jax.figures.training import training_curve
 from dln_jax.learning.latency import one_step
-from dln_jax.metrics.motions import on_grid, padded, predict_measured, prediction_metrics
 from dln_jax.metrics.phase_space import (
     Motions,
     energies,
@@ -24,6 +23,7 @@ from dln_jax.metrics.phase_space import (
     predict,
     quarter_period,
 )
+from dln_jax.metrics.predictions import on_grid, padded, predict_measured, prediction_metrics
 from dln_jax.metrics.verdict import judge_motions
 from dln_jax.runs.report import Report, png
 from dln_jax.zoo.run import Run

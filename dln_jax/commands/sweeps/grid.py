@@ -121,10 +121,10 @@ def jobs_of(
         for text in {"0" if text.isdecimal() and len(text) < 10 else text: text for text in texts}.values():
             line = [*(first | {name: words[name][text]}).values()]
             try:
-                parsed = parse(arguments, prog=prog, description=None, line=line, common=CompilationCache)
+                own, _ = parse(arguments, prog=prog, description=None, line=line, common=CompilationCache)
             except InputError as error:
                 raise InputError(f"{source}: {error}") from None
-            value = getattr(parsed.own, name, None)
+            value = getattr(own, name, None)
             if isinstance(value, Path) and not value.exists():
                 raise InputError(f"{source}: {name}={text}: no such file or folder")
     # Within an allocation of several tasks, a job would otherwise take itself for one process of a larger run.

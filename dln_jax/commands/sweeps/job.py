@@ -13,9 +13,9 @@ from typing import Any, Literal, NamedTuple
 from filelock import FileLock
 
 from dln_jax.files import as_type, is_file, read_json, write_json
+from dln_jax.runs.folder import CONFIG, LOCK
 from dln_jax.runs.running import INTERRUPTED
 from dln_jax.types import InputError
-from dln_jax.zoo.run_folder import CONFIG, LOCK
 
 STATUS = "status.json"
 OUTPUT = "output.txt"

@@ -46,9 +46,9 @@ from dln_jax.learning.weak_forms import STEPS
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.metrics.verdict import Verdict
 from dln_jax.runs.arguments import names_listed
+from dln_jax.runs.folder import command_folder
 from dln_jax.runs.progress import progress
 from dln_jax.runs.report import Report, finish, png
-from dln_jax.runs.stored_arguments import command_folder
 from dln_jax.sizes import require_memory
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import save

@@ -18,9 +18,9 @@ from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
 from dln_jax.files import finite
 from dln_jax.precision import with_float64
 from dln_jax.runs.arguments import names_listed, numbers_of, refuse_given, require_positive_if_given
+from dln_jax.runs.folder import command_folder
 from dln_jax.runs.report import Report, finish, png
 from dln_jax.runs.scaled import mesh_of
-from dln_jax.runs.stored_arguments import command_folder
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import load, save
 from dln_jax.zoo.value_functions import (

@@ -23,7 +23,7 @@ from dln_jax.learning.uncertainty import Estimate, estimate
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees.description import dh_frames, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters
-from dln_jax.metrics.coverage import LEVEL, coverage
+from dln_jax.metrics.errors import LEVEL, coverage
 from dln_jax.models.model import Parameters
 from dln_jax.models.trees import make_rigid_tree
 from dln_jax.precision import quick_compilation
@@ -163,7 +163,7 @@ def judged(model: Model, parameters: Parameters, known: Estimate, *tests: Trajec
         chunks = design_chunks(design(model), parameters, data, CHUNK, even=False)
         error = np.concatenate([predicted - measured for _, predicted, measured in chunks])
         std, flags = bands(model, parameters, known.uncertainty, data)
-        results.append((coverage(error, std, levels=(LEVEL,)).shares[0], float(flags.mean())))
+        results.append((coverage(error, std, levels=(LEVEL,))[0], float(flags.mean())))
     return results
 
 

@@ -23,7 +23,7 @@ from dln_jax.learning.kinematics.fit import fit_tree
 from dln_jax.learning.linear import design, unravelled
 from dln_jax.mechanics.trees.description import Tree, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters
-from dln_jax.metrics.motions import cut_segments, predict_measured, valid_times
+from dln_jax.metrics.predictions import cut_segments, predict_measured, valid_times
 from dln_jax.models.model import Parameters
 from dln_jax.models.trees import make_rigid_tree, tree_of
 from dln_jax.models.trigonometric import make_planar_chain

@@ -11,7 +11,7 @@ from filelock import FileLock
 
 from dln_jax import InputError
 from dln_jax.files import write_json
-from dln_jax.zoo.run_folder import CONFIG, LOCK, run_folder
+from dln_jax.runs.folder import CONFIG, LOCK, run_folder
 
 
 @pytest.fixture(autouse=True)
@@ -48,7 +48,7 @@ def test_a_disk_without_locks_is_named(monkeypatch):
 def test_a_second_writer_is_refused_until_the_first_has_died():
     """A process that is killed leaves its lock file, and no lock."""
     code = (
-        "import time; from pathlib import Path; from dln_jax.zoo.run_folder import run_folder\n"
+        "import time; from pathlib import Path; from dln_jax.runs.folder import run_folder\n"
         "with run_folder(Path('shared'), 'x'): print('locked', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as first:
