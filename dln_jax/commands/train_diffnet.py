@@ -33,8 +33,8 @@ UNITS = {
 
 
 @dataclass(frozen=True)
-class FunctionOptions:
-    """The function to learn, the network and its optimiser."""
+class Arguments(Drawn, Scaled, Resumable):
+    """The function to learn, the network and its optimiser, and where the results go."""
 
     function: Annotated[str, choice((*NAMES, "FILE.npz"))] = "sin"
     """Function to learn; an npz file has x [N, n], y [N, m], optional dy [N, m, n] and d2y [N, m, n, n]."""
@@ -70,23 +70,25 @@ class FunctionOptions:
     """Seed of data, validation split, parameters and shuffling."""
 
 
-@dataclass(frozen=True)
-class Arguments(Drawn, Scaled, Resumable, FunctionOptions):
-    """What to train on, how, and where the results go."""
-
-
 def main(options: Arguments) -> None:
     """Trains and evaluates the network, and writes the run folder."""
     import jax
     import numpy as np
 
     from dln_jax.commands.functions import figures as drawing
-    from dln_jax.commands.functions.errors import errors, predict, verdict_of
-    from dln_jax.commands.functions.units import Units, layers_in_own_units, standard_units, to_units
+    from dln_jax.commands.functions.networks import (
+        Units,
+        errors,
+        layers_in_own_units,
+        predict,
+        standard_units,
+        to_units,
+        verdict_of,
+    )
     from dln_jax.data.functions import SampleSplit, load, published, published_grid, split
     from dln_jax.learning.engine.checkpoint import Checkpoint, identity
     from dln_jax.learning.engine.optimisers import GaussNewton, check
-    from dln_jax.learning.engine.problem import Progress, Training
+    from dln_jax.learning.engine.problem import Progress, Training, losses
     from dln_jax.learning.functions import GAUSS_NEWTON, WIDTHS, Network, grow_width, published_adam, targets, train
     from dln_jax.learning.latency import one_step
     from dln_jax.nn.activations import activation
@@ -165,9 +167,7 @@ def main(options: Arguments) -> None:
         with progress(total) as show:
 
             def report(at: Progress) -> None:
-                stage = f", {at.stage}" if at.stage else ""
-                text = f"loss {at.loss:.3e}  validation {at.validation:.3e}"
-                show(min(at.step, total), f"width {network.width}{stage}: {text}")
+                show(min(at.step, total), f"width {network.width}{at.stage and f', {at.stage}'}: {losses(at)}")
 
             return train(standard, network, optimiser, checkpoint=checkpoint, report=report, mesh=mesh)
 

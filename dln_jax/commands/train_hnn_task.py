@@ -8,8 +8,9 @@ structured-hnn, black-box-hnn, pairwise-hnn (bodies), polynomial-hamiltonian (on
 learned where the needs state it. Load the model with dln_jax.load.
 """
 
+import functools
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -126,35 +127,16 @@ class Direct:
     """planar-chain: joint angles, or angles from the vertical (default: relative)."""
 
 
-@dataclass(frozen=True)
-class GeneratedNetwork(Networks, Generated, Motion):
-    """A network, and generated motions to train it on."""
-
-
-@dataclass(frozen=True)
-class GeneratedDirect(Direct, Generated, Motion):
-    """A model without a network, and generated motions to fit it to."""
-
-
-@dataclass(frozen=True)
-class RecordedNetwork(Networks, Recorded, Motion):
-    """A network, and recorded motions to train it on."""
-
-
-@dataclass(frozen=True)
-class RecordedDirect(Direct, Recorded, Motion):
-    """A model without a network, and recorded motions to fit it to."""
-
-
-Options = GeneratedNetwork | GeneratedDirect | RecordedNetwork | RecordedDirect
+@functools.cache
+def options_with(*kinds: type) -> type:
+    """The dataclass of all options of these kinds."""
+    return make_dataclass("Options", [], bases=kinds, frozen=True)
 
 
 def class_of(stated: Mapping[str, Any]) -> type:
     """Options of the task and the model that a command line selects."""
-    network, direct = GeneratedNetwork, GeneratedDirect
-    if stated.get("task") in RECORDED:
-        network, direct = RecordedNetwork, RecordedDirect
-    return direct if stated.get("model") in DIRECT else network
+    model = Direct if stated.get("model") in DIRECT else Networks
+    return options_with(model, Recorded if stated.get("task") in RECORDED else Generated, Motion)
 
 
 @dataclass(frozen=True)
@@ -172,7 +154,7 @@ class Arguments(Motion):
     )
 
 
-def main(options: Options) -> None:
+def main(options: Motion) -> None:
     """Trains and evaluates the model, and writes the run folder.
 
     Raises:
@@ -200,16 +182,10 @@ def main(options: Options) -> None:
         if getattr(options, name, None) is not None and getattr(options, choice_of) not in values:
             option = f"--{name.replace('_', '-')}"
             raise InputError(f"{option} is an option of --{choice_of} {values[0]}; add that, or leave {option} out")
-    optimizer, rate = options.optimizer, None
-    if isinstance(options, Networks):
-        keywords = {name: getattr(options, name) for name in ("width", "depth", "activation", "field")}
-        rate = options.learning_rate
-    else:
-        keywords = {"degree": options.degree, "coordinates": options.coordinates}
-    networks = optimizer == "adam" or any(value is not None for value in keywords.values())
-    if isinstance(options, Recorded):
-        keywords["order"] = options.order
-    name = "gauss-newton" if optimizer == "auto" else optimizer
+    optimizer, names = options.optimizer, ("width", "depth", "activation", "field", "degree", "coordinates", "order")
+    keywords = {name: value for name in names if (value := getattr(options, name, None)) is not None}
+    networks = optimizer == "adam" or not keywords.keys() <= {"order"}
+    name, rate = "gauss-newton" if optimizer == "auto" else optimizer, getattr(options, "learning_rate", None)
     optimiser = optimiser_named(name, precision="f64", learning_rate=rate)
     log = read(options)
     if options.model == POLYNOMIAL:
@@ -236,14 +212,15 @@ def main(options: Options) -> None:
         finish(folder, options, report._replace(ended_by_user=options.steps is not None or fit.stop == "time"))
 
 
-def read(options: Options) -> "PhaseLog":
+def read(options: Motion) -> "PhaseLog":
     """The motions of the task."""
     from dln_jax.commands.phase_spaces.data import generate, read_motions
     from dln_jax.runs.arguments import numbers_of
     from dln_jax.runs.logs import facts, needs_of
 
-    if not isinstance(options, Recorded):
+    if isinstance(options, Generated):
         return generate(options.task, options.trajectories)
+    assert isinstance(options, Recorded)
     noise = None if options.noise is None else numbers_of("--noise", options.noise, positive=True)
     known = {"needs": needs_of(options.needs), "test": options.test, "noise": noise}
     return read_motions(options.task, options.data, **known, **facts(options))

@@ -74,7 +74,7 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
     from dln_jax.locomotion.task import CLOCK_PERIOD, creature_named, make_task
     from dln_jax.locomotion.worlds import Variation
     from dln_jax.runs.progress import progress
-    from dln_jax.runs.report import Report, finish, png
+    from dln_jax.runs.report import Report, finish, png, rows_of
     from dln_jax.runs.scaled import mesh_of
     from dln_jax.runs.stored_arguments import command_folder
     from dln_jax.scale.devices import device_lines
@@ -168,5 +168,4 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
             "learning.png": png(learning_figure, curves),
             "gait.gif": lambda path: write_gait(path, task, seen, shown),
         }
-        rows = [(name.replace("_", " "), f"{value:.4g}") for name, value in metrics.items()]
-        finish(folder, options, Report(metrics, rows, title, ("quantity", "value"), lines=lines, figures=figures))
+        finish(folder, options, Report(metrics, rows_of(metrics), title, lines=lines, figures=figures))

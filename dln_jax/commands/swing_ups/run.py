@@ -9,8 +9,15 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from dln_jax.commands.swing_ups.any_plant import learn_to_swing_up, try_plant
-from dln_jax.commands.swing_ups.desktop import MODELS, errors_along, obtain, recorded, test_motions
+from dln_jax.commands.swing_ups.learning import (
+    MODELS,
+    errors_along,
+    learn_to_swing_up,
+    obtain,
+    recorded,
+    test_motions,
+    try_plant,
+)
 from dln_jax.control.closed_loop import ClosedLoopRun, Hardware, Outcomes, Push, hanging_starts
 from dln_jax.control.desktop_plants import (
     SECONDS,
@@ -47,7 +54,7 @@ from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.metrics.verdict import Verdict
 from dln_jax.runs.arguments import names_listed
 from dln_jax.runs.progress import progress
-from dln_jax.runs.report import Report, finish, png
+from dln_jax.runs.report import Report, finish, png, rows_of
 from dln_jax.runs.stored_arguments import command_folder
 from dln_jax.sizes import require_memory
 from dln_jax.types import InputError, require_positive, require_seed
@@ -152,10 +159,12 @@ def measured_traces(runs: list[PlantRun], layout: Layout) -> Figure:
     """Figure of some runs, with measurements in place of the states."""
     y = np.stack([run.y for run in runs])
     u = np.stack([run.u for run in runs])
-    shown = ClosedLoopRun(runs[0].t, np.concatenate([y, np.zeros_like(y)], axis=2), u[:, :-1], y)  # type: ignore[arg-type]
-    goal = np.concatenate([layout.goal, np.zeros_like(layout.goal)])
-    limits = tuple(layout.limits.control.T)
-    return closed_loop_traces(shown, layout.joints, names=layout.names, goal=goal, limits=limits)
+    x = np.concatenate([y, np.zeros_like(y)], axis=2)
+    shown = ClosedLoopRun(runs[0].t, x, u[:, :-1], y)  # type: ignore[arg-type]
+    goal = np.pad(layout.goal, (0, len(layout.goal)))
+    return closed_loop_traces(
+        shown, layout.joints, names=layout.names, goal=goal, limits=tuple(layout.limits.control.T)
+    )
 
 
 def of_desktop(desk: DesktopPlant, layout: Layout, options: Any, folder: Path) -> Report:
@@ -240,12 +249,8 @@ def report_of(
     figures: Mapping[str, Callable[[Path], None]],
 ) -> Report:
     """Numbers of swing-ups from many starts, and the verdict on the law."""
-    metrics = {
-        "success_share": outcomes.share,
-        "median_seconds": outcomes.median,
-        "worst_seconds": outcomes.worst,
-        **metrics,
-    }
+    times = {"median_seconds": outcomes.median, "worst_seconds": outcomes.worst}
+    metrics = {"success_share": outcomes.share, **times, **metrics}
     starts, pushed = len(outcomes.seconds), "" if push is None else f", pushed after {push.seconds:.3g} s"
     level, remedy = "good", ""
     if outcomes.share < 1:
@@ -253,9 +258,7 @@ def report_of(
         remedy = "record longer (--seconds-of-data), or widen the limits of the plant"
     return Report(
         metrics=metrics,
-        rows=[
-            (key.replace("_", " "), f"{value:.4g}", "s" if "seconds" in key else "") for key, value in metrics.items()
-        ],
+        rows=rows_of(metrics),
         title=f"swing-ups from {starts} starts",
         verdict=Verdict(level, f"{outcomes.share:.1%} of {starts} starts up after {seconds:.3g} s{pushed}", remedy),
         figures=figures,

@@ -18,7 +18,7 @@ from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
 from dln_jax.files import finite
 from dln_jax.precision import with_float64
 from dln_jax.runs.arguments import names_listed, numbers_of, refuse_given, require_positive_if_given
-from dln_jax.runs.report import Report, finish, png
+from dln_jax.runs.report import Report, finish, png, rows_of
 from dln_jax.runs.scaled import mesh_of
 from dln_jax.runs.stored_arguments import command_folder
 from dln_jax.types import InputError, require_positive, require_seed
@@ -161,9 +161,7 @@ def report_of(run: ValueRun, options: Any, numbers: Mapping[str, float], extreme
     numbers = {**numbers, **measured}
     return Report(
         metrics={**finite(numbers), "verdict": verdict.number},
-        rows=[
-            (key.replace("_", " "), f"{value:.4g}", "s" if "seconds" in key else "") for key, value in numbers.items()
-        ],
+        rows=rows_of(numbers),
         title=f"returns from {options.starts} starts hanging, and anywhere",
         verdict=verdict,
         figures={"value.png": png(value_plane, run), "closed-loop.png": png(closed_loop, run)},
