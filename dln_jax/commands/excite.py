@@ -71,7 +71,7 @@ def main(options: Arguments) -> None:
     from dln_jax.data.csv_tables import write_motion
     from dln_jax.data.robots import read_robot
     from dln_jax.figures.torques import excitation_figure
-    from dln_jax.files import write_figure, write_json
+    from dln_jax.files import write_json
     from dln_jax.identification.excitation.design import (
         as_trajectories,
         design_set,
@@ -86,7 +86,7 @@ def main(options: Arguments) -> None:
     from dln_jax.mechanics.trees.inertia import inertial_parameters
     from dln_jax.models.trees import make_rigid_tree
     from dln_jax.runs.progress import progress
-    from dln_jax.runs.report import Report, finish
+    from dln_jax.runs.report import Report, finish, png
     from dln_jax.runs.stored_arguments import command_folder
     from dln_jax.sizes import require_memory
     from dln_jax.types import require_positive
@@ -138,28 +138,23 @@ def main(options: Arguments) -> None:
             train, validation = design_set(task, drawn, trajectories=count, say=show)
         designs = [*train, validation]
 
-        def data_at(rate: float) -> schema.Trajectories:
-            """The motions with their predicted torques, at this sampling rate in Hz."""
-            needs = tree.needs._replace(friction=bool(robot.damping.any()))
-            data = as_trajectories(designs, labels, model, parameters, rate=rate, needs=needs)
-            return data._replace(joint_names=np.array(names))
-
-        data = data_at(options.rate)
+        needs = tree.needs._replace(friction=bool(robot.damping.any()))
+        data = as_trajectories(designs, labels, model, parameters, rate=options.rate, needs=needs)
+        data = data._replace(joint_names=np.array(names))
         schema.save(folder / "excitation.npz", data)
         for index, label in enumerate(labels):
             rows = data.trajectory == index
             columns = (data.t[rows], data.q[rows], data.qd[rows])
             write_motion(folder / f"{label}.csv", *columns, names=names, joints=tree.joints)
-        motions = {label: design.motion for label, design in zip(labels, designs, strict=True)}
-        series = {
-            label: {
+        series = {}
+        for label, (motion, *_) in zip(labels, designs, strict=True):
+            sines, cosines = np.split(np.asarray(motion.coefficients), 2, axis=1)
+            series[label] = {
                 "period": motion.period,
                 "offset": np.asarray(motion.offset).tolist(),
-                "sines": np.asarray(motion.coefficients)[:, : options.harmonics].tolist(),
-                "cosines": np.asarray(motion.coefficients)[:, options.harmonics :].tolist(),
+                "sines": sines.tolist(),
+                "cosines": cosines.tolist(),
             }
-            for label, motion in motions.items()
-        }
         write_json(folder / "motions.json", {"joints": list(names), "motions": series})
 
         # A random set combines as many motions as the training set.
@@ -197,12 +192,8 @@ def main(options: Arguments) -> None:
         table = [(name, f"{number:.3g}", f"{logarithm:.1f}", near) for name, number, logarithm, near in rows]
         shown = {"q": limits.position, "qd": np.stack([-limits.velocity, limits.velocity], 1), "tau": limits.force}
 
-        def draw(path: Path) -> None:
-            # The figure is some thousand points wide: a higher rate would not show.
-            data = data_at(max(400, 3 * options.harmonics) / options.seconds)
-            write_figure(path, excitation_figure(data, shown, names=names, conditions=conditions))
-
+        figure = png(excitation_figure, data, shown, names=names, conditions=conditions)
         ratio = metrics["standard_error_ratio_median"]
         line = f"standard errors of {size:.0f} base parameters: {ratio:.2f} of those after random motions, on average"
         columns = ("motion", "condition", "log det", "nearest limit")
-        finish(folder, options, Report(metrics, table, "", columns, lines=(line,), figures={"excitation.png": draw}))
+        finish(folder, options, Report(metrics, table, "", columns, lines=(line,), figures={"excitation.png": figure}))

@@ -167,7 +167,8 @@ def main(options: Arguments) -> None:
         with progress(total) as show:
 
             def report(at: Progress) -> None:
-                show(min(at.step, total), f"width {network.width}{at.stage and f', {at.stage}'}: {losses(at)}")
+                stage = f", {at.stage}" if at.stage else ""
+                show(min(at.step, total), f"width {network.width}{stage}: {losses(at)}")
 
             return train(standard, network, optimiser, checkpoint=checkpoint, report=report, mesh=mesh)
 

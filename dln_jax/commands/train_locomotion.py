@@ -66,8 +66,7 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
     """
     import numpy as np
 
-    from dln_jax.commands.locomotion.figures import SHOWN, learning_figure, write_gait
-    from dln_jax.commands.locomotion.policies import NAME, judge, load_policy
+    from dln_jax.commands.locomotion import NAME, SHOWN, judge, learning_figure, load_policy, write_gait
     from dln_jax.locomotion.gradient import GradientSettings, shown_walk, train
     from dln_jax.locomotion.learning import GOAL, LANES, Goal, Record, evaluation_steps, median_to_reach
     from dln_jax.locomotion.perturbed import numbers_of, perturbed_trials

@@ -20,6 +20,8 @@ from dln_jax.runs.arguments import arguments_for, pairs_of, parse
 from dln_jax.runs.options import CompilationCache
 
 RANGE = re.compile(r"(-?\d{1,18}):(-?\d{1,18})(?::(-?\d{1,18}))?")
+NAME = re.compile(r"^(?:--)?([^=]*)")
+"""An option's name at the start of a word, after hyphens that are left out."""
 MOST_JOBS = 10_000
 EXAMPLE = "expected for example 'width=8,16 seed=0:10'"
 OF_SWEEPS = ("out", "resume", "processes", "coordinator", "process_id")
@@ -33,9 +35,7 @@ def pairs(option: str, text: str) -> dict[str, str]:
         words = shlex.split(text)
     except ValueError as error:
         raise InputError(f"{option} is {text!r:.60}: {str(error).lower()}; close the quotes") from None
-    names = [word.partition("=")[0] for word in words]
-    known = [name.removeprefix("--").replace("-", "_") for name in names]
-    return pairs_of(option, [own + word[len(name) :] for own, name, word in zip(known, names, words, strict=True)])
+    return pairs_of(option, [NAME.sub(lambda name: name[1].replace("-", "_"), word) for word in words])
 
 
 def grid_of(text: str) -> dict[str, tuple[str, ...]]:
@@ -104,10 +104,9 @@ def jobs_of(
             raise InputError(f"{source}: {name} is {text!r:.40}; expected yes or no")
         return f"--{option}" if TRUTH[text.lower()] else f"--no-{option}"
 
-    options = {name: ("--fixed", (text,)) for name, text in fixed.items()}
-    options |= {name: ("--grid", tuple(texts)) for name, texts in grid.items()}
     words: dict[str, dict[str, str]] = {}
-    for name, (source, texts) in options.items():
+    for name, texts in {**{name: (text,) for name, text in fixed.items()}, **grid}.items():
+        source = "--grid" if name in grid else "--fixed"
         if name in OF_SWEEPS:
             raise InputError(f"{source} has {name}, which every job gets from the sweep; leave it out")
         if name not in types:
@@ -116,17 +115,17 @@ def jobs_of(
         words[name] = {text: word(source, name, text) for text in texts}
     first = {name: next(iter(by_text.values())) for name, by_text in words.items()}
     prog = f"python -m dln_jax {command}"
-    for name, (source, texts) in options.items():
+    for name, texts in words.items():
         # Parsing takes milliseconds, so that one whole number is checked for all.
         for text in {"0" if text.isdecimal() and len(text) < 10 else text: text for text in texts}.values():
-            line = [*(first | {name: words[name][text]}).values()]
+            line = [*(first | {name: texts[text]}).values()]
             try:
                 parsed = parse(arguments, prog=prog, description=None, line=line, common=CompilationCache)
             except InputError as error:
-                raise InputError(f"{source}: {error}") from None
+                raise InputError(f"{'--grid' if name in grid else '--fixed'}: {error}") from None
             value = getattr(parsed.own, name, None)
             if isinstance(value, Path) and not value.exists():
-                raise InputError(f"{source}: {name}={text}: no such file or folder")
+                raise InputError(f"{'--grid' if name in grid else '--fixed'}: {name}={text}: no such file or folder")
     # Within an allocation of several tasks, a job would otherwise take itself for one process of a larger run.
     common = [first[name] for name in fixed] + ["--processes=1"] * ("processes" in types)
     jobs = []

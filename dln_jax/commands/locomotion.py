@@ -1,18 +1,24 @@
-"""Loads the policy of a run of `train_locomotion`, and judges it on any ground."""
+"""Policies of soft creatures: stored ones, their verdict on any ground, and figures of the learning and of the gait."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import msgspec
+import numpy as np
+from matplotlib.figure import Figure
 
+from dln_jax.figures import style
+from dln_jax.figures.soft_bodies import write_soft_body_gif
 from dln_jax.files import as_type
-from dln_jax.locomotion.learning import Parameters, Policy, make_policy
+from dln_jax.locomotion.learning import GOAL, Parameters, Policy, Record, make_policy
 from dln_jax.locomotion.perturbed import STEPS, Trials
-from dln_jax.locomotion.task import LocomotionTask, creature_named, make_task
+from dln_jax.locomotion.task import LocomotionTask, Walk, beginning, creature_named, make_task
 from dln_jax.locomotion.worlds import Variation
 from dln_jax.metrics.verdict import Verdict
+from dln_jax.softbody.terms.creature import TIME_STEP, ground_height
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import MODEL, REMEDY, load_manifest, load_tree
 
@@ -20,6 +26,10 @@ NAME = "locomotion-gradient"
 """Name of the model in its manifest."""
 GOOD, REFUSED = 0.95, 0.5
 """A policy is good from the first share of episodes without a fall on, and refused below the second."""
+FILMED = 160
+"""Steps of the film."""
+SHOWN = 3_000_000
+"""Seed of the rough ground that is shown."""
 
 
 class StoredPolicy(NamedTuple):
@@ -80,10 +90,43 @@ def judge(trials: Trials, steps: int = STEPS) -> Verdict:
     reason = f"{standing.sum()} of {count} episodes of {steps} steps end without a fall"
     if standing.sum() < REFUSED * count:
         return Verdict("refused", reason, "train on this ground")
-    behind = int((trials.distance[standing] < 0).sum())
-    if behind:
+    if behind := (trials.distance[standing] < 0).sum():
         return Verdict("doubtful", f"{reason}, but {behind} of them end behind their start", "train on this ground")
     if standing.sum() < GOOD * count:
         expected = math.ceil(GOOD * count)
         return Verdict("doubtful", f"{reason}, expected {expected}", "train on this ground, or longer")
     return Verdict("good", reason)
+
+
+def learning_figure(seeds: Sequence[Sequence[Record]]) -> Figure:
+    """Distance of every evaluation against environment steps, with a line per seed."""
+    figure, [[axis]] = style.figure(height=3.4)
+    for records in seeds:
+        steps, distances = [record.steps for record in records], [record.distance for record in records]
+        axis.plot(steps, distances, color=style.BLUE, linewidth=1.2, alpha=0.8)
+    axis.axhline(GOAL, color="0.6", linewidth=0.8, linestyle="--")
+    axis.set(xlabel="environment steps", ylabel="distance in one episode, body lengths")
+    style.title(axis, f"gradient, {len(seeds)} seed{'s' if len(seeds) > 1 else ''}")
+    return figure
+
+
+def write_gait(path: Path, task: LocomotionTask, seen: Walk, title: str) -> None:
+    """Writes a GIF of the first steps of a walk; in the plane with the ground of the seed `SHOWN`."""
+    x = np.concatenate([task.creature.mesh.vertices[None], seen.x])[: FILMED + 1]
+    ground, bumps = 0.0, beginning(task, jax.random.key(SHOWN)).world.bumps
+    if bumps is not None and x.shape[2] == 2:
+        margin = 0.2 * task.length
+        along = np.linspace(x[..., 0].min() - margin, x[..., 0].max() + margin, 500)
+        ground = np.stack([along, jax.vmap(lambda at: ground_height(bumps, (at,)))(along)], axis=1)
+    write_soft_body_gif(
+        path,
+        task.creature.mesh,
+        x,
+        TIME_STEP * np.arange(len(x)),
+        muscles=task.creature.muscles,
+        ground=ground,
+        actuation=np.concatenate([seen.actuation[:1], seen.actuation])[: FILMED + 1],
+        title=title,
+        stride=2,
+        frames_per_second=0.5 / TIME_STEP,
+    )
