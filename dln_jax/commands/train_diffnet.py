@@ -217,7 +217,7 @@ def main(options: Arguments) -> None:
             figures["surfaces.png"] = png(drawing.surfaces, shown, mean)
         else:
             figures["parity.png"] = png(drawing.parity, to_units(shown, units), to_units(mean, units))
-        metrics = {**errors(predicted, test), "verdict": verdict.number}
+        metrics: dict[str, float | int] = {**errors(predicted, test)}
         if box is not None and spread is not None:
             inside = np.all(abs(shown.x) <= box, axis=1)
             for name, where in (("spread_inside", inside), ("spread_outside", ~inside)):
@@ -234,12 +234,8 @@ def main(options: Arguments) -> None:
         if training.stop.reason == "not finite":
             lines = ("the loss stopped being finite; the run keeps the best parameters before that", *lines)
         report = Report(
-            metrics=metrics,
-            rows=[
-                (key.replace("_", " "), number(key, value), unit_of(key, UNITS))
-                for key, value in metrics.items()
-                if key != "verdict"
-            ],
+            metrics=metrics | {"verdict": verdict.number},
+            rows=[(key.replace("_", " "), number(key, value), unit_of(key, UNITS)) for key, value in metrics.items()],
             title=f"test on {function}, {network.precision}",
             verdict=verdict,
             ended_by_user=bool(options.steps or options.epochs),

@@ -69,8 +69,8 @@ def train(options: Any) -> None:
         name = str(options.run or file)
         actuated, control = names_listed(options.actuated), positive_numbers(options, "control")
         control = control[0] if control is not None and len(control) == 1 else control
-        source, read = (file, of_file) if options.run is None else (options.run, of_run)
-        model, known, lacking = read(source, actuated, control, goal)
+        read = of_file if options.run is None else of_run
+        model, known, lacking = read(options.run or file, actuated, control, goal)
         problem = problem_of(
             model,
             known,
@@ -131,11 +131,11 @@ def train(options: Any) -> None:
         save_value(folder, name, goal, settings, best.parameters, problem)
         metrics = {"train_seconds": best.train_seconds, "validation": best.validation}
         if len(trained) > 1:
-            validation = [training.validation for training in trained]
+            _, validation, seconds = zip(*trained, strict=True)
             metrics |= {
                 "validation_median": float(np.median(validation)),
                 "validation_worst": float(np.max(validation)),
-                "train_seconds_median": float(np.median([training.train_seconds for training in trained])),
+                "train_seconds_median": float(np.median(seconds)),
             }
         run = ValueRun(name, plant, network, with_float64(best.parameters), problem)
         finish(folder, options, report_of(run, options, metrics, extremes))

@@ -48,8 +48,8 @@ def by_iteration(
     folder: Path,
     identity: Any,
     resume: bool,
-    mesh: Mesh | None = None,
-    disturbance: Disturbance | None = None,
+    mesh: Mesh | None,
+    disturbance: Disturbance | None,
 ) -> list[Trained]:
     """Fits value functions by fitted value iteration, one per seed; devices share the states.
 
@@ -102,8 +102,8 @@ def by_equation(
     iterations: int,
     seeds: range,
     *,
-    mesh: Mesh | None = None,
-    disturbance: Disturbance | None = None,
+    mesh: Mesh | None,
+    disturbance: Disturbance | None,
 ) -> list[Trained]:
     """Fits one value function per seed by the Hamilton-Jacobi-Bellman residual; devices of a mesh share the samples."""
     discounts, done = discounts_down_to(problem.discount), itertools.count(1)
