@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import msgspec
@@ -41,20 +41,12 @@ class StoredPolicy(NamedTuple):
     width: int
 
 
-class _Settings(msgspec.Struct):
-    width: int
-
-
 class _Model(msgspec.Struct):
     name: str
     creature: str
     clock_period: float
     variation: dict[str, float]
-    settings: _Settings
-
-
-class _Manifest(msgspec.Struct):
-    model: _Model
+    settings: dict[str, Any]
 
 
 def load_policy(folder: str | Path, **variation: float | None) -> StoredPolicy:
@@ -68,20 +60,20 @@ def load_policy(folder: str | Path, **variation: float | None) -> StoredPolicy:
     """
     folder = Path(folder)
     path = folder / f"{MODEL}.json"
-    model = as_type(load_manifest(folder, MODEL), _Manifest, name=str(path), remedy=REMEDY).model
+    model = as_type(load_manifest(folder, MODEL).get("model"), _Model, name=str(path), remedy=REMEDY)
     if model.name != NAME:
         raise InputError(f"{path} holds '{model.name:.60}'; expected a policy of train_locomotion, '{NAME}'")
     changed = {name: value for name, value in variation.items() if value is not None}
     try:
         creature, trained = creature_named(model.creature), Variation(**model.variation)
         task = make_task(creature, variation=trained, clock_period=model.clock_period)
-        policy = make_policy(task, width=model.settings.width)
-    except (InputError, TypeError) as error:
+        policy = make_policy(task, width=model.settings["width"])
+    except (InputError, KeyError, TypeError) as error:
         raise InputError(f"{path}: {error}; {REMEDY}") from None
     if changed:
         task = make_task(creature, variation=trained._replace(**changed), clock_period=model.clock_period)
     like = jax.eval_shape(policy.init, jax.random.key(0))
-    return StoredPolicy(task, policy, load_tree(folder, MODEL, like), model.settings.width)
+    return StoredPolicy(task, policy, load_tree(folder, MODEL, like), model.settings["width"])
 
 
 def judge(trials: Trials, steps: int = STEPS) -> Verdict:

@@ -72,8 +72,8 @@ class Arguments(Drawn, Scaled, Resumable):
 
 def main(options: Arguments) -> None:
     """Trains and evaluates the network, and writes the run folder."""
-    import jax
     import numpy as np
+    import optax
 
     from dln_jax.commands.functions import figures as drawing
     from dln_jax.commands.functions.networks import (
@@ -113,10 +113,11 @@ def main(options: Arguments) -> None:
         bound = np.pi * (SHARE_OF_DATA if several else 1)
         sampling = resolved(options, {"samples": 25_600})
         data = published(function, **sampling, bound=bound, seed=seed)
-        test = published_grid(function, bound=bound)
+        test = shown = published_grid(function, bound=bound)
+        if several:
+            shown, box = published_grid(function), bound
         n, m = data.inputs, data.outputs
         units = Units(np.zeros(n), np.ones(n), np.zeros(m), np.ones(m))
-        shown, box = (published_grid(function), bound) if several else (test, None)
     else:
         refuse_given(options, ["samples"], "an option of --function sin and cos_sin")
         if not function.endswith(".npz"):
@@ -175,8 +176,8 @@ def main(options: Arguments) -> None:
     with command_folder(options, "train_diffnet") as folder:
         counts = f"{len(sets.train.x)} training, {len(sets.validation.x)} validation, {len(test.x)} test samples"
         print(f"{function}: {counts}, {data.inputs} inputs, {data.outputs} outputs", *remarks, sep="\n")
-        width = "grown" if is_grown else str(network.width)
-        layers = " x ".join([str(data.inputs), *[width] * network.depth, str(data.outputs)])
+        width = "grown" if is_grown else network.width
+        layers = " x ".join(map(str, [data.inputs, *[width] * network.depth, data.outputs]))
         terms = ["value", *["gradient"] * (network.loss == "type1"), *["Hessian"] * (network.derivative == 2)]
         trained = f"{network.loss}: {', '.join(terms)}; {options.optimizer}, {network.precision}"
         print(f"{f'{options.ensemble} networks' if several else 'network'} {layers}, {network.activation}; {trained}")
@@ -227,7 +228,7 @@ def main(options: Arguments) -> None:
             else:
                 figures["ensemble.png"] = png(drawing.ensemble_maps, spread, box)
         latency = one_step(run.derivatives, [(x,) for x in test.x[:512]], calls=1000)
-        parameters = sum(leaf.size for leaf in jax.tree.leaves(run.parameters))
+        parameters = int(optax.tree.size(run.parameters))
         metrics |= {"validation_loss": float(training.validation), "width": network.width}
         metrics |= cost_metrics(training, latency, parameters=parameters, best_step=training.best_step)
         lines = (RELU,) if network.activation == "relu" else ()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import optax
 
 from dln_jax.commands.phase_spaces.data import PhaseLog, spreads
 from dln_jax.commands.phase_spaces.training import MOTIONS, RATES, PhaseFit
@@ -147,7 +148,7 @@ def errors(log: PhaseLog, fit: PhaseFit, predicted: list[Motions]) -> dict[str, 
     return numbers | {
         "train_seconds": fit.history[-1].seconds if fit.history else 0.0,
         "compile_seconds": fit.compile_seconds,
-        "parameters": float(sum(leaf.size for leaf in jax.tree.leaves(parameters))),
+        "parameters": float(optax.tree.size(parameters)),
     }
 
 

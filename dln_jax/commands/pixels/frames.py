@@ -199,10 +199,8 @@ def film_errors(model: ImageModel, parameters: Any, test: Films) -> tuple[dict[s
     q, p = apply("encode", model, parameters, pairs)
     moved = move(q[:, 0], p[:, 0], np.arange(float(pairs.shape[1])))
     later = move(q[:, 0], p[:, 0], np.concatenate([[0.0], LATE]))
-    films, recoded, late = (
-        np.asarray(apply("decode", model, parameters, *states))
-        for states in ((moved.q, moved.p), (q, p), (later.q[:, 1:], later.p[:, 1:]))
-    )
+    states = (moved.q, moved.p), (q, p), (later.q[:, 1:], later.p[:, 1:])
+    films, recoded, late = (np.asarray(apply("decode", model, parameters, *state)) for state in states)
     true = energy(test.q, test.qd)[:, :-1]
     return {
         **summary("energy_mse", energy_errors(films, true)),

@@ -68,11 +68,10 @@ def run_motion(prepared: PreparedScene, precision: Any) -> SimulatedMotion:
     params = example.scene.params
     start = state = in_precision(init(), precision)
 
-    def observe(state: State, info: Info) -> tuple[Any, Any, Info]:
-        return state.x, state.v, info
-
     def advance(state: State, params: Params, driven: Any) -> tuple[State, Any]:
-        return rollout(functools.partial(step, params), state, driven, observe=observe)
+        return rollout(
+            functools.partial(step, params), state, driven, observe=lambda state, info: (state.x, state.v, info)
+        )
 
     with progress(steps) as show:
         began = time.perf_counter()

@@ -228,7 +228,7 @@ def sweep_figure(results: Mapping[str, Any], at_once: int | None) -> Figure | No
     shown += [(group["values"], group["medians"], MEDIAN) for group in results["groups"] if over]
     seconds, error = names["train_seconds"], names["error"]
     points = [(values, numbers.get(seconds), numbers.get(error), size) for values, numbers, size in shown]
-    points = [point for point in points if point[1] is not None and point[2] is not None]
+    points = [point for point in points if None not in point[1:3]]
     if not points:
         return None
     problems = list(dict.fromkeys(problem_of(row["values"]) for row in rows))

@@ -187,15 +187,14 @@ def of_desktop(desk: DesktopPlant, layout: Layout, options: Any, folder: Path) -
         save(folder, *obtained.fitted)
         print(f"learned: controls {late:.3g} sample(s) late, q filtered at {obtained.prepared.cutoff:.3g} Hz")
     torque, acceleration = errors_along(desk, model, test_motions(desk, seed=seed))
-    process = None
-    if options.estimator != "differences":
-        process = from_log(model, recording, actuation=B, delay=late).process
+    filtered = options.estimator != "differences"
+    process = from_log(model, recording, actuation=B, delay=late).process if filtered else None
     measured = estimator = estimator_of(options.estimator, layout, process, delay=late)
     law = law_of(desk, model, measured)
     if options.recover == "plans":
         upright = upright_for(desk, model)
-        scales = scales_of(upright, layout)
-        plans = recovering(upright, layout, scales, desk.numbers, law.regulator, desk.numbers.level)
+        numbers = desk.numbers
+        plans = recovering(upright, layout, scales_of(upright, layout), numbers, law.regulator, numbers.level)
         estimator = lambda _: measured(plans)  # noqa: E731
     push = push_at_half(layout, options.push, SECONDS)
     tried = try_starts(desk, model, starts=options.starts, seed=seed, estimator=estimator, push=push)
@@ -220,7 +219,7 @@ def draw(
     run = motion_of(desk, model, seconds=SHOWN if push is None else SECONDS, estimator=estimator, push=push)
     starts = hanging_starts(count, options.seed, position=desk.position)
     runs = jax.jit(jax.vmap(run))(starts, jax.random.split(jax.random.key(options.seed), count))
-    t, x, u = (np.asarray(array) for array in (runs.t[0], runs.x, runs.u))
+    t, x, u = (np.asarray(array) for array in (runs.t[0], runs.x[0], runs.u[0]))
     needs, sizes = desk.scene.needs, desk.sizes
     energy = passive_energy(without_friction(model), parts_of(needs.actuation), np.zeros(2))
     of_pole = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(runs.x)
@@ -233,7 +232,7 @@ def draw(
     write_figure(path, figure)
     last = int(np.searchsorted(t, FILMED if push is None else push.seconds + FILMED))
     film = path.with_name("swing-up.gif")
-    write_closed_loop_gif(film, drawing, t[:last], x[0, :last, :2], u[0, :last, 0], **shared)
+    write_closed_loop_gif(film, drawing, t[:last], x[:last, :2], u[:last, 0], **shared)
 
 
 def push_at_half(layout: Layout, rate: float, seconds: float) -> Push | None:

@@ -180,11 +180,11 @@ def ranges_of(text: str) -> list[tuple[float, float]]:
     """Parses the ranges of --positions, such as -0.5:0.5,free."""
     ranges = []
     for part in text.split(","):
-        low, _, high = part.strip().replace("free", "-inf:inf").partition(":")
         try:
-            ranges.append((float(low), float(high)))
+            low, high = map(float, part.strip().replace("free", "-inf:inf").split(":"))
         except ValueError:
-            ranges.append((np.nan, np.nan))
-        if not ranges[-1][0] < ranges[-1][1]:
+            low = high = np.nan
+        if not low < high:
             raise InputError(f"--positions has {part!r:.40}; expected LOW:HIGH or free for every joint: -1:1,free")
+        ranges.append((low, high))
     return ranges

@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 from dln_jax.control.optimal.fitted import Iteration, IterationState, ValueProgress, fit_values
 from dln_jax.control.optimal.plants import Returns, ValuePlant, Where, evaluate, starts
 from dln_jax.control.optimal.problem import ControlProblem
-from dln_jax.control.optimal.residual import ResidualStage, discounts_down_to, fit_hjb
+from dln_jax.control.optimal.residual import discounts_down_to, fit_hjb
 from dln_jax.control.optimal.value_networks import ValueNetwork
 from dln_jax.control.optimal.worst_case import Disturbance
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
@@ -75,10 +75,6 @@ def by_iteration(
         store(checkpoint(seed), state[:3], history)
 
     with progress(len(seeds) * numbers.iterations, "iterations") as show:
-
-        def report(at: ValueProgress) -> None:
-            show(before + at.iteration, f"cost and misfit {at.validation:.4g}")
-
         fits = fit_values(
             problem,
             network,
@@ -86,7 +82,7 @@ def by_iteration(
             numbers=numbers,
             mesh=mesh,
             disturbance=disturbance,
-            report=report,
+            report=lambda at: show(before + at.iteration, f"cost and misfit {at.validation:.4g}"),
             restore=start,
             store=keep,
         )
@@ -109,10 +105,6 @@ def by_equation(
     discounts, done = discounts_down_to(problem.discount), itertools.count(1)
     trained = []
     with progress(len(seeds) * (len(discounts) - 1 + ROUNDS), "iterations") as show:
-
-        def report(stage: ResidualStage) -> None:
-            show(next(done), f"discount {stage.discount:.3g}/s, residual {stage.validation:.2e}")
-
         for seed in seeds:
             of_parameters, of_samples = jax.random.split(jax.random.key(seed))
             began = time.perf_counter()
@@ -126,7 +118,7 @@ def by_equation(
                 rounds=ROUNDS,
                 mesh=mesh,
                 disturbance=disturbance,
-                report=report,
+                report=lambda at: show(next(done), f"discount {at.discount:.3g}/s, residual {at.validation:.2e}"),
             )
             trained.append(Trained(solution.parameters, solution.validation, time.perf_counter() - began))
     return trained
