@@ -13,7 +13,7 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from dln_jax.commands.sweeps.job import METRICS, Job, status_of
+from dln_jax.commands.sweeps.jobs import METRICS, Job, status_of
 from dln_jax.figures import style
 from dln_jax.files import as_type, finite, is_file, read_json, write_bytes, write_json
 from dln_jax.runs.report import print_numbers

@@ -1,23 +1,33 @@
 """A run of train_value: reads its options, trains or loads a value function, evaluates it and finishes the folder."""
 
 import dataclasses
-from collections.abc import Mapping
+import itertools
+import math
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
-from dln_jax.commands.values.figures import closed_loop, value_plane
+from dln_jax.commands.values.evaluation import closed_loop, evaluation, value_plane, verdict_of
 from dln_jax.commands.values.plants import of_file, of_run, problem_of, uncertain_numbers, with_factors
-from dln_jax.commands.values.training import by_equation, by_iteration, evaluation, verdict_of
-from dln_jax.control.optimal.fitted import Iteration
+from dln_jax.control.optimal.fitted import Iteration, IterationState, ValueProgress, fit_values
 from dln_jax.control.optimal.own_plants import described, own_settings
 from dln_jax.control.optimal.plants import FITS, ValuePlant, ValueSettings
-from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
+from dln_jax.control.optimal.problem import ControlProblem
+from dln_jax.control.optimal.residual import discounts_down_to, fit_hjb
+from dln_jax.control.optimal.value_networks import ValueNetwork
+from dln_jax.control.optimal.worst_case import Bounds, Disturbance, worst_disturbance
 from dln_jax.files import finite
+from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
+from dln_jax.learning.engine.problem import Progress
 from dln_jax.precision import with_float64
 from dln_jax.runs.arguments import names_listed, numbers_of, refuse_given, require_positive_if_given
+from dln_jax.runs.progress import progress
 from dln_jax.runs.report import Report, finish, png, rows_of
 from dln_jax.runs.scaled import mesh_of
 from dln_jax.runs.stored_arguments import command_folder
@@ -40,6 +50,8 @@ ITERATIONS = 15
 """Gauss-Newton iterations per discount."""
 OF_RESIDUAL = ValueSettings((24, 24), Iteration(), 30.0)
 """Networks for the residual of a published plant."""
+ROUNDS = 6
+"""Number of resamplings at the problem's own discount."""
 
 
 def train(options: Any) -> None:
@@ -119,25 +131,23 @@ def train(options: Any) -> None:
                 network,
                 iteration,
                 seeds,
-                folder=folder,
-                identity=identity,
-                resume=options.resume,
+                lambda seed: Checkpoint(folder, {"settings": identity}, options.resume, f"checkpoint_seed_{seed}"),
                 mesh=mesh,
                 disturbance=disturbance,
             )
-        best = min(trained, key=lambda training: training.validation)
+        parameters, lowest, seconds = min(trained, key=lambda training: training[1])
         if model is not None:
             save(folder, model.description, model.parameters)
-        save_value(folder, name, goal, settings, best.parameters, problem)
-        metrics = {"train_seconds": best.train_seconds, "validation": best.validation}
+        save_value(folder, name, goal, settings, parameters, problem)
+        metrics = {"train_seconds": seconds, "validation": lowest}
         if len(trained) > 1:
-            _, validation, seconds = zip(*trained, strict=True)
+            _, validation, spent = zip(*trained, strict=True)
             metrics |= {
                 "validation_median": float(np.median(validation)),
                 "validation_worst": float(np.max(validation)),
-                "train_seconds_median": float(np.median(seconds)),
+                "train_seconds_median": float(np.median(spent)),
             }
-        run = ValueRun(name, plant, network, with_float64(best.parameters), problem)
+        run = ValueRun(name, plant, network, with_float64(parameters), problem)
         finish(folder, options, report_of(run, options, metrics, extremes))
 
 
@@ -188,3 +198,83 @@ def ranges_of(text: str) -> list[tuple[float, float]]:
             raise InputError(f"--positions has {part!r:.40}; expected LOW:HIGH or free for every joint: -1:1,free")
         ranges.append((low, high))
     return ranges
+
+
+def by_iteration(
+    problem: ControlProblem,
+    network: ValueNetwork,
+    numbers: Iteration,
+    seeds: range,
+    checkpoint: Callable[[int], Checkpoint],
+    *,
+    mesh: Mesh | None,
+    disturbance: Disturbance | None,
+) -> list[tuple[Any, float, float]]:
+    """Fits value functions by fitted value iteration, one per seed; devices share the states.
+
+    The folder gets a checkpoint of every seed; a stored one with the same identity, JSON values that decide
+    the result, is resumed bit for bit.
+    """
+    before = 0
+
+    def start(seed: int, state: IterationState) -> IterationState:
+        nonlocal before
+        before = numbers.iterations * (seed - seeds.start)
+        if (stored := restore(checkpoint(seed), state[:3])) is None:
+            return state
+        tree, history = stored
+        done = [ValueProgress(at.step, at.loss, at.validation, at.seconds) for at in history]
+        return IterationState(*tree, history=done)
+
+    def keep(seed: int, state: IterationState) -> None:
+        history = [Progress(at.iteration, at.loss, at.validation, math.nan, at.seconds, "") for at in state.history]
+        store(checkpoint(seed), state[:3], history)
+
+    with progress(len(seeds) * numbers.iterations, "iterations") as show:
+        fits = fit_values(
+            problem,
+            network,
+            seeds,
+            numbers=numbers,
+            mesh=mesh,
+            disturbance=disturbance,
+            report=lambda at: show(before + at.iteration, f"cost and misfit {at.validation:.4g}"),
+            restore=start,
+            store=keep,
+        )
+    return [
+        (fit.parameters, min(at.validation for at in fit.history), fit.train_seconds + fit.compile_seconds)
+        for fit in fits
+    ]
+
+
+def by_equation(
+    problem: ControlProblem,
+    network: ValueNetwork,
+    iterations: int,
+    seeds: range,
+    *,
+    mesh: Mesh | None,
+    disturbance: Disturbance | None,
+) -> list[tuple[Any, float, float]]:
+    """Fits one value function per seed by the Hamilton-Jacobi-Bellman residual; devices of a mesh share the samples."""
+    discounts, done = discounts_down_to(problem.discount), itertools.count(1)
+    trained = []
+    with progress(len(seeds) * (len(discounts) - 1 + ROUNDS), "iterations") as show:
+        for seed in seeds:
+            of_parameters, of_samples = jax.random.split(jax.random.key(seed))
+            began = time.perf_counter()
+            solution = fit_hjb(
+                problem,
+                network.value_and_gradient,
+                network.init(of_parameters),
+                of_samples,
+                discounts=discounts,
+                iterations=iterations,
+                rounds=ROUNDS,
+                mesh=mesh,
+                disturbance=disturbance,
+                report=lambda at: show(next(done), f"discount {at.discount:.3g}/s, residual {at.validation:.2e}"),
+            )
+            trained.append((solution.parameters, solution.validation, time.perf_counter() - began))
+    return trained
