@@ -161,12 +161,14 @@ def main(options: Motion) -> None:
         InputError: a mistake in the options or data; nothing is then left behind.
         FitRefused: the model must not be used, and no limit of the user ended its training; the run folder is complete.
     """
+    from dln_jax.commands.phase_spaces.data import generate, read_motions
     from dln_jax.commands.phase_spaces.models import choose_model, description_of
     from dln_jax.commands.phase_spaces.results import evaluate
     from dln_jax.commands.phase_spaces.training import POLYNOMIAL, train
     from dln_jax.learning.context import Context
     from dln_jax.learning.engine.optimisers import optimiser_named
-    from dln_jax.runs.arguments import require_positive_if_given
+    from dln_jax.runs.arguments import numbers_of, require_positive_if_given
+    from dln_jax.runs.logs import facts, needs_of
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import finish
     from dln_jax.runs.scaled import mesh_of
@@ -187,7 +189,12 @@ def main(options: Motion) -> None:
     networks = optimizer == "adam" or not keywords.keys() <= {"order"}
     name, rate = "gauss-newton" if optimizer == "auto" else optimizer, getattr(options, "learning_rate", None)
     optimiser = optimiser_named(name, precision="f64", learning_rate=rate)
-    log = read(options)
+    if isinstance(options, Recorded):
+        noise = None if options.noise is None else numbers_of("--noise", options.noise, positive=True)
+        known = {"needs": needs_of(options.needs), "test": options.test, "noise": noise}
+        log = read_motions(options.task, options.data, **known, **facts(options))
+    else:
+        log = generate(options.task, getattr(options, "trajectories", None))
     if options.model == POLYNOMIAL:
         if optimizer == "adam":
             raise InputError("the polynomial model is one least-squares problem; leave --optimizer out")
@@ -210,20 +217,6 @@ def main(options: Motion) -> None:
         if report.error:
             report = report._replace(error=f"{report.error}; {folder} holds the best model before that")
         finish(folder, options, report._replace(ended_by_user=options.steps is not None or fit.stop == "time"))
-
-
-def read(options: Motion) -> "PhaseLog":
-    """The motions of the task."""
-    from dln_jax.commands.phase_spaces.data import generate, read_motions
-    from dln_jax.runs.arguments import numbers_of
-    from dln_jax.runs.logs import facts, needs_of
-
-    if isinstance(options, Generated):
-        return generate(options.task, options.trajectories)
-    assert isinstance(options, Recorded)
-    noise = None if options.noise is None else numbers_of("--noise", options.noise, positive=True)
-    known = {"needs": needs_of(options.needs), "test": options.test, "noise": noise}
-    return read_motions(options.task, options.data, **known, **facts(options))
 
 
 def lines_on(log: "PhaseLog", description: dict[str, Any]) -> Iterator[str]:

@@ -93,32 +93,35 @@ def compare(
                 f"--{option}: no job has the metric {name!r:.40}; choose from {', '.join(sorted(known))}. Jobs that "
                 f"are done are kept: --resume with another --{option} only makes the table"
             )
-    names = {kind: next((name for name in usual if name in known), None) for kind, usual in COMPARED.items()}
-    names |= {kind: name for kind, name in (("validation", metric), ("error", error)) if name is not None}
+    stated = {"validation": metric, "error": error}
+    names = {
+        kind: stated.get(kind) or next((name for name in usual if name in known), None)
+        for kind, usual in COMPARED.items()
+    }
     judge = names["validation"]
     chosen = [row for row in rows if row["metrics"].get(judge) is not None]
-    for rivals in classes(chosen, lambda row: problem_of(row["values"])):
+    for rivals in classes(chosen, lambda row: problem_of(row["values"])).values():
         if len(rivals) > 1:
             (max if largest else min)(rivals, key=lambda row: row["metrics"][judge])["best"] = True
     groups = []
-    for part in classes(rows, lambda row: [(name, text) for name, text in row["values"].items() if name not in over]):
+    others = classes(rows, lambda row: [(name, text) for name, text in row["values"].items() if name not in over])
+    for values, part in others.items():
         medians, worst = {}, {}
         for name in filter(None, names.values()):
             numbers = [number for row in part if (number := row["metrics"].get(name)) is not None]
             medians[name] = statistics.median(numbers) if numbers else None
             worst[name] = (min if largest and name == judge else max)(numbers, default=None)
-        values = {name: text for name, text in part[0]["values"].items() if name not in over}
         done = sum(row["state"] == "done" for row in part)
-        groups.append({"values": values, "done": done, "jobs": len(part), "medians": medians, "worst": worst})
+        groups.append({"values": dict(values), "done": done, "jobs": len(part), "medians": medians, "worst": worst})
     return {"names": names, "over": list(over), "metrics": known, "jobs": rows, "groups": groups}
 
 
-def classes(rows: Iterable[dict[str, Any]], key: Callable[[dict[str, Any]], Any]) -> list[list[dict[str, Any]]]:
-    """Rows with the same key, in the order of the rows."""
+def classes(rows: Iterable[dict[str, Any]], key: Callable[[dict[str, Any]], Any]) -> dict[Any, list[dict[str, Any]]]:
+    """Rows by their key, in the order of the rows."""
     groups: dict[Any, list[dict[str, Any]]] = {}
     for row in rows:
         groups.setdefault(tuple(key(row)), []).append(row)
-    return list(groups.values())
+    return groups
 
 
 def problem_of(values: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
@@ -163,8 +166,8 @@ def print_results(results: Mapping[str, Any], command: str, folder: Path) -> Non
         print(f"{names['error']} is of the test, and took no part in the choice")
     if missed:
         print(unfinished(rows))
-        for part in classes(missed, lambda row: (row["state"], row["line"])):
-            print(f"  {', '.join(row['job'] for row in part)} {part[0]['state']}: {part[0]['line']}")
+        for (state, line), part in classes(missed, lambda row: (row["state"], row["line"])).items():
+            print(f"  {', '.join(row['job'] for row in part)} {state}: {line}")
         print(f"--out {folder} --resume does them again")
     print(f"sweep: {folder}")
 

@@ -212,8 +212,7 @@ def by_iteration(
 ) -> list[tuple[Any, float, float]]:
     """Fits value functions by fitted value iteration, one per seed; devices share the states.
 
-    The folder gets a checkpoint of every seed; a stored one with the same identity, JSON values that decide
-    the result, is resumed bit for bit.
+    Every iteration is stored in the checkpoint of its seed; a stored seed is resumed bit for bit.
     """
     before = 0
 
