@@ -37,10 +37,10 @@ class Arguments(Folder):
 
 def main(options: Arguments) -> None:
     """Evaluates the policy, prints and writes the numbers."""
-    from dln_jax.commands.locomotion.policies import judge, load_policy
+    from dln_jax.commands.locomotion import judge, load_policy
     from dln_jax.locomotion.perturbed import numbers_of, perturbed_trials
     from dln_jax.runs.folder import command_folder
-    from dln_jax.runs.report import Report, finish
+    from dln_jax.runs.report import Report, finish, rows_of
     from dln_jax.types import require_positive, require_seed
 
     sizes = {"starts": options.starts, "steps": options.steps}
@@ -51,8 +51,7 @@ def main(options: Arguments) -> None:
     with command_folder(options, "evaluate_locomotion") as folder:
         trials = perturbed_trials(task, policy, parameters, **sizes, seed=options.seed)
         verdict, numbers = judge(trials, options.steps), numbers_of(trials, options.steps)
-        rows = [(name.replace("_", " "), f"{value:.4g}") for name, value in numbers.items()]
         title = ", ".join(f"{name} {value:g}" for name, value in task.variation._asdict().items())
         title = f"{task.creature.name}: {title}"
         metrics = {**numbers, "verdict": float(verdict.number)}
-        finish(folder, options, Report(metrics, rows, title, ("quantity", "value"), verdict=verdict))
+        finish(folder, options, Report(metrics, rows_of(numbers), title, verdict=verdict))

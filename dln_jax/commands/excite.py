@@ -9,6 +9,7 @@ state them. A list of numbers has one for each joint.
 
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from dln_jax.errors import InputError
@@ -71,7 +72,7 @@ def main(options: Arguments) -> None:
     from dln_jax.data.csv_tables import write_motion
     from dln_jax.data.robots import read_robot
     from dln_jax.figures.torques import excitation_figure
-    from dln_jax.files import write_figure, write_json
+    from dln_jax.files import write_json
     from dln_jax.identification.excitation.design import (
         as_trajectories,
         design_set,
@@ -86,7 +87,7 @@ def main(options: Arguments) -> None:
     from dln_jax.models.trees import make_rigid_tree
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
-    from dln_jax.runs.report import Report, finish
+    from dln_jax.runs.report import Report, finish, png
     from dln_jax.sizes import require_memory
     from dln_jax.types import require_positive
 
@@ -104,14 +105,13 @@ def main(options: Arguments) -> None:
         tree = with_payload(tree, d - 1, inertial_parameters(options.payload, centre, np.zeros((3, 3))))
     elif options.payload_position != "0,0,0":
         raise InputError("--payload-position is for a --payload, which is not given; add its mass, or leave it out")
-    texts = {name: getattr(options, name) for name in ("position", "velocity", "acceleration", "torque")}
     stated = {
-        name: None if text is None else numbers_of(f"--{name}", text, [1, d], positive=True)
-        for name, text in texts.items()
+        name: numbers_of(f"--{name}", text, [1, d], positive=True)
+        for name in ("position", "velocity", "acceleration", "torque")
+        if (text := getattr(options, name)) is not None
     }
-    limits, assumed = limits_of_robot(
-        robot, force=stated.pop("torque"), **stated, allow_unlimited=names_listed(options.allow_unlimited)
-    )
+    free = names_listed(options.allow_unlimited)
+    limits, assumed = limits_of_robot(robot, force=stated.pop("torque", None), **stated, allow_unlimited=free)
     for line in assumed:
         print(f"warning: {line}")
     limits = scale_limits(limits, options.share)
@@ -137,50 +137,42 @@ def main(options: Arguments) -> None:
             train, validation = design_set(task, drawn, trajectories=count, say=show)
         designs = [*train, validation]
 
-        def data_at(rate: float) -> schema.Trajectories:
-            """The motions with their predicted torques, at this sampling rate in Hz."""
-            needs = tree.needs._replace(friction=bool(robot.damping.any()))
-            data = as_trajectories(designs, labels, model, parameters, rate=rate, needs=needs)
-            return data._replace(joint_names=np.array(names))
-
-        data = data_at(options.rate)
+        needs = tree.needs._replace(friction=bool(robot.damping.any()))
+        data = as_trajectories(designs, labels, model, parameters, rate=options.rate, needs=needs)
+        data = data._replace(joint_names=np.array(names))
         schema.save(folder / "excitation.npz", data)
         for index, label in enumerate(labels):
             rows = data.trajectory == index
             columns = (data.t[rows], data.q[rows], data.qd[rows])
             write_motion(folder / f"{label}.csv", *columns, names=names, joints=tree.joints)
-        motions = {label: design.motion for label, design in zip(labels, designs, strict=True)}
-        series = {
-            label: {
+        series = {}
+        for label, (motion, *_) in zip(labels, designs, strict=True):
+            sines, cosines = np.split(np.asarray(motion.coefficients), 2, axis=1)
+            series[label] = {
                 "period": motion.period,
                 "offset": np.asarray(motion.offset).tolist(),
-                "sines": np.asarray(motion.coefficients)[:, : options.harmonics].tolist(),
-                "cosines": np.asarray(motion.coefficients)[:, options.harmonics :].tolist(),
+                "sines": sines.tolist(),
+                "cosines": cosines.tolist(),
             }
-            for label, motion in motions.items()
-        }
         write_json(folder / "motions.json", {"joints": list(names), "motions": series})
 
         # A random set combines as many motions as the training set.
         groups = [drawn[place : place + count] for place in range(0, len(drawn) - count + 1, count)]
         ratios = [error_ratio(train, group) for group in groups]
-        conditions = {
-            "random": [design.condition for design in drawn],
-            "designed": [design.condition for design in designs],
-        }
-        size = float(task.columns.size)
+        random, designed = ([design.condition for design in motions] for motions in (drawn, designs))
+        condition, determinant = together(train)
         metrics = {
-            "base_parameters": size,
-            "random_condition_median": float(np.median(conditions["random"])),
-            "random_condition_best": min(conditions["random"]),
-            "train_condition_worst": max(conditions["designed"][:-1]),
+            "base_parameters": float(task.columns.size),
+            "random_condition_median": median(random),
+            "random_condition_best": min(random),
+            "train_condition_worst": max(designed[:-1]),
             "validation_condition": validation.condition,
-            "random_set_condition_median": float(np.median([together(group)[0] for group in groups])),
-            "train_set_condition": together(train)[0],
-            "random_log_determinant_median": float(np.median([design.log_determinant for design in drawn])),
-            "train_set_log_determinant": together(train)[1],
-            "standard_error_ratio_median": float(np.median(ratios)),
-            "standard_error_ratio_worst": float(np.max(ratios)),
+            "random_set_condition_median": median(together(group)[0] for group in groups),
+            "train_set_condition": condition,
+            "random_log_determinant_median": median(design.log_determinant for design in drawn),
+            "train_set_log_determinant": determinant,
+            "standard_error_ratio_median": median(ratios),
+            "standard_error_ratio_worst": max(ratios),
             "least_slack": min(design.slack for design in designs),
         }
 
@@ -191,17 +183,13 @@ def main(options: Arguments) -> None:
                 for label, design in zip(labels, designs, strict=True)
             ),
             (f"random, {count} together", metrics["random_set_condition_median"], np.nan, ""),
-            (f"train, {count} together", *together(train), ""),
+            (f"train, {count} together", condition, determinant, ""),
         ]
         table = [(name, f"{number:.3g}", f"{logarithm:.1f}", near) for name, number, logarithm, near in rows]
         shown = {"q": limits.position, "qd": np.stack([-limits.velocity, limits.velocity], 1), "tau": limits.force}
 
-        def draw(path: Path) -> None:
-            # The figure is some thousand points wide: a higher rate would not show.
-            data = data_at(max(400, 3 * options.harmonics) / options.seconds)
-            write_figure(path, excitation_figure(data, shown, names=names, conditions=conditions))
-
-        ratio = metrics["standard_error_ratio_median"]
-        line = f"standard errors of {size:.0f} base parameters: {ratio:.2f} of those after random motions, on average"
+        figure = png(excitation_figure, data, shown, names=names, conditions={"random": random, "designed": designed})
+        size, ratio = task.columns.size, metrics["standard_error_ratio_median"]
+        line = f"standard errors of {size} base parameters: {ratio:.2f} of those after random motions, on average"
         columns = ("motion", "condition", "log det", "nearest limit")
-        finish(folder, options, Report(metrics, table, "", columns, lines=(line,), figures={"excitation.png": draw}))
+        finish(folder, options, Report(metrics, table, "", columns, lines=(line,), figures={"excitation.png": figure}))

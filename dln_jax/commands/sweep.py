@@ -56,10 +56,8 @@ class Arguments(Resumable):
 def main(options: Arguments) -> None:
     """Checks the grid, runs the jobs and shows the results; raises `SystemExit` with 1 if a job is not done."""
     from dln_jax.commands.sweeps.executors import cores, here, ray, run, slurm
-    from dln_jax.commands.sweeps.figure import sweep_figure
-    from dln_jax.commands.sweeps.grid import closest, grid_of, jobs_of, pairs
-    from dln_jax.commands.sweeps.job import status_of
-    from dln_jax.commands.sweeps.table import compare, print_results, write_tables
+    from dln_jax.commands.sweeps.jobs import closest, grid_of, jobs_of, pairs, status_of
+    from dln_jax.commands.sweeps.results import compare, print_results, sweep_figure, write_tables
     from dln_jax.files import write_figure
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress

@@ -33,8 +33,8 @@ UNITS = {
 
 
 @dataclass(frozen=True)
-class FunctionOptions:
-    """The function to learn, the network and its optimiser."""
+class Arguments(Drawn, Scaled, Resumable):
+    """The function to learn, the network and its optimiser, and where the results go."""
 
     function: Annotated[str, choice((*NAMES, "FILE.npz"))] = "sin"
     """Function to learn; an npz file has x [N, n], y [N, m], optional dy [N, m, n] and d2y [N, m, n, n]."""
@@ -70,23 +70,25 @@ class FunctionOptions:
     """Seed of data, validation split, parameters and shuffling."""
 
 
-@dataclass(frozen=True)
-class Arguments(Drawn, Scaled, Resumable, FunctionOptions):
-    """What to train on, how, and where the results go."""
-
-
 def main(options: Arguments) -> None:
     """Trains and evaluates the network, and writes the run folder."""
-    import jax
     import numpy as np
+    import optax
 
     from dln_jax.commands.functions import figures as drawing
-    from dln_jax.commands.functions.errors import errors, predict, verdict_of
-    from dln_jax.commands.functions.units import Units, layers_in_own_units, standard_units, to_units
+    from dln_jax.commands.functions.networks import (
+        Units,
+        errors,
+        layers_in_own_units,
+        predict,
+        standard_units,
+        to_units,
+        verdict_of,
+    )
     from dln_jax.data.functions import SampleSplit, load, published, published_grid, split
     from dln_jax.learning.engine.checkpoint import Checkpoint, identity
     from dln_jax.learning.engine.optimisers import GaussNewton, check
-    from dln_jax.learning.engine.problem import Progress, Training
+    from dln_jax.learning.engine.problem import Progress, Training, losses
     from dln_jax.learning.functions import GAUSS_NEWTON, WIDTHS, Network, grow_width, published_adam, targets, train
     from dln_jax.learning.latency import one_step
     from dln_jax.nn.activations import activation
@@ -111,10 +113,11 @@ def main(options: Arguments) -> None:
         bound = np.pi * (SHARE_OF_DATA if several else 1)
         sampling = resolved(options, {"samples": 25_600})
         data = published(function, **sampling, bound=bound, seed=seed)
-        test = published_grid(function, bound=bound)
+        test = shown = published_grid(function, bound=bound)
+        if several:
+            shown, box = published_grid(function), bound
         n, m = data.inputs, data.outputs
         units = Units(np.zeros(n), np.ones(n), np.zeros(m), np.ones(m))
-        shown, box = (published_grid(function), bound) if several else (test, None)
     else:
         refuse_given(options, ["samples"], "an option of --function sin and cos_sin")
         if not function.endswith(".npz"):
@@ -166,16 +169,15 @@ def main(options: Arguments) -> None:
 
             def report(at: Progress) -> None:
                 stage = f", {at.stage}" if at.stage else ""
-                text = f"loss {at.loss:.3e}  validation {at.validation:.3e}"
-                show(min(at.step, total), f"width {network.width}{stage}: {text}")
+                show(min(at.step, total), f"width {network.width}{stage}: {losses(at)}")
 
             return train(standard, network, optimiser, checkpoint=checkpoint, report=report, mesh=mesh)
 
     with command_folder(options, "train_diffnet") as folder:
         counts = f"{len(sets.train.x)} training, {len(sets.validation.x)} validation, {len(test.x)} test samples"
         print(f"{function}: {counts}, {data.inputs} inputs, {data.outputs} outputs", *remarks, sep="\n")
-        width = "grown" if is_grown else str(network.width)
-        layers = " x ".join([str(data.inputs), *[width] * network.depth, str(data.outputs)])
+        width = "grown" if is_grown else network.width
+        layers = " x ".join(map(str, [data.inputs, *[width] * network.depth, data.outputs]))
         terms = ["value", *["gradient"] * (network.loss == "type1"), *["Hessian"] * (network.derivative == 2)]
         trained = f"{network.loss}: {', '.join(terms)}; {options.optimizer}, {network.precision}"
         print(f"{f'{options.ensemble} networks' if several else 'network'} {layers}, {network.activation}; {trained}")
@@ -216,7 +218,7 @@ def main(options: Arguments) -> None:
             figures["surfaces.png"] = png(drawing.surfaces, shown, mean)
         else:
             figures["parity.png"] = png(drawing.parity, to_units(shown, units), to_units(mean, units))
-        metrics = {**errors(predicted, test), "verdict": verdict.number}
+        metrics: dict[str, float | int] = {**errors(predicted, test)}
         if box is not None and spread is not None:
             inside = np.all(abs(shown.x) <= box, axis=1)
             for name, where in (("spread_inside", inside), ("spread_outside", ~inside)):
@@ -226,19 +228,15 @@ def main(options: Arguments) -> None:
             else:
                 figures["ensemble.png"] = png(drawing.ensemble_maps, spread, box)
         latency = one_step(run.derivatives, [(x,) for x in test.x[:512]], calls=1000)
-        parameters = sum(leaf.size for leaf in jax.tree.leaves(run.parameters))
+        parameters = int(optax.tree.size(run.parameters))
         metrics |= {"validation_loss": float(training.validation), "width": network.width}
         metrics |= cost_metrics(training, latency, parameters=parameters, best_step=training.best_step)
         lines = (RELU,) if network.activation == "relu" else ()
         if training.stop.reason == "not finite":
             lines = ("the loss stopped being finite; the run keeps the best parameters before that", *lines)
         report = Report(
-            metrics=metrics,
-            rows=[
-                (key.replace("_", " "), number(key, value), unit_of(key, UNITS))
-                for key, value in metrics.items()
-                if key != "verdict"
-            ],
+            metrics=metrics | {"verdict": verdict.number},
+            rows=[(key.replace("_", " "), number(key, value), unit_of(key, UNITS)) for key, value in metrics.items()],
             title=f"test on {function}, {network.precision}",
             verdict=verdict,
             ended_by_user=bool(options.steps or options.epochs),

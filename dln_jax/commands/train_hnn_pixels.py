@@ -13,8 +13,8 @@ from dln_jax.runs.options import Drawn, Resumable
 
 
 @dataclass(frozen=True)
-class PixelOptions:
-    """Films of a pendulum, and what is learned from them."""
+class Arguments(Drawn, Resumable):
+    """Films of a pendulum, what is learned from them, and where the results go."""
 
     model: Literal["black-box-hnn", "phase-network"] = "black-box-hnn"
     """An energy in the latent plane, or a network that gives the rates there."""
@@ -24,11 +24,6 @@ class PixelOptions:
     """Steps of adam (default: those of the published recipe)."""
     seed: int = 0
     """Seed of parameters and shuffling."""
-
-
-@dataclass(frozen=True)
-class Arguments(Drawn, Resumable, PixelOptions):
-    """What to train on, how, and where the results go."""
 
 
 def main(options: Arguments) -> None:
@@ -44,7 +39,7 @@ def main(options: Arguments) -> None:
     from dln_jax.learning.engine.problem import losses
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
-    from dln_jax.runs.report import Report, finish, png
+    from dln_jax.runs.report import Report, finish, png, rows_of
     from dln_jax.types import require_seed
     from dln_jax.zoo.descriptions import build
     from dln_jax.zoo.run import save
@@ -78,9 +73,8 @@ def main(options: Arguments) -> None:
             figures["pixels-injection.png"] = png(injection_figure, build(description), parameters, test)
         report = Report(
             metrics={key: value for key, value in numbers.items() if np.isfinite(value)} | {"verdict": verdict.number},
-            rows=[(name.replace("_", " "), f"{value:.4g}") for name, value in numbers.items()],
+            rows=rows_of(numbers),
             title=f"test films, {kind}",
-            columns=("quantity", "value"),
             verdict=verdict,
             figures=figures,
             ended_by_user=options.steps is not None,

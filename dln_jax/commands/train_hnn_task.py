@@ -8,8 +8,9 @@ structured-hnn, black-box-hnn, pairwise-hnn (bodies), polynomial-hamiltonian (on
 learned where the needs state it. Load the model with dln_jax.load.
 """
 
+import functools
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -126,35 +127,16 @@ class Direct:
     """planar-chain: joint angles, or angles from the vertical (default: relative)."""
 
 
-@dataclass(frozen=True)
-class GeneratedNetwork(Networks, Generated, Motion):
-    """A network, and generated motions to train it on."""
-
-
-@dataclass(frozen=True)
-class GeneratedDirect(Direct, Generated, Motion):
-    """A model without a network, and generated motions to fit it to."""
-
-
-@dataclass(frozen=True)
-class RecordedNetwork(Networks, Recorded, Motion):
-    """A network, and recorded motions to train it on."""
-
-
-@dataclass(frozen=True)
-class RecordedDirect(Direct, Recorded, Motion):
-    """A model without a network, and recorded motions to fit it to."""
-
-
-Options = GeneratedNetwork | GeneratedDirect | RecordedNetwork | RecordedDirect
+@functools.cache
+def options_with(*kinds: type) -> type:
+    """The dataclass of all options of these kinds."""
+    return make_dataclass("Options", [], bases=kinds, frozen=True)
 
 
 def class_of(stated: Mapping[str, Any]) -> type:
     """Options of the task and the model that a command line selects."""
-    network, direct = GeneratedNetwork, GeneratedDirect
-    if stated.get("task") in RECORDED:
-        network, direct = RecordedNetwork, RecordedDirect
-    return direct if stated.get("model") in DIRECT else network
+    model = Direct if stated.get("model") in DIRECT else Networks
+    return options_with(model, Recorded if stated.get("task") in RECORDED else Generated, Motion)
 
 
 @dataclass(frozen=True)
@@ -172,20 +154,21 @@ class Arguments(Motion):
     )
 
 
-def main(options: Options) -> None:
+def main(options: Motion) -> None:
     """Trains and evaluates the model, and writes the run folder.
 
     Raises:
         InputError: a mistake in the options or data; nothing is then left behind.
         FitRefused: the model must not be used, and no limit of the user ended its training; the run folder is complete.
     """
+    from dln_jax.commands.phase_spaces.data import generate, read_motions
     from dln_jax.commands.phase_spaces.models import choose_model, description_of
     from dln_jax.commands.phase_spaces.results import evaluate
     from dln_jax.commands.phase_spaces.training import POLYNOMIAL, train
     from dln_jax.learning.engine.checkpoint import Context
     from dln_jax.learning.engine.optimisers import optimiser_named
     from dln_jax.process import deadline
-    from dln_jax.runs.arguments import require_positive_if_given
+    from dln_jax.runs.arguments import facts, needs_of, numbers_of, require_positive_if_given
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import finish
@@ -200,18 +183,17 @@ def main(options: Options) -> None:
         if getattr(options, name, None) is not None and getattr(options, choice_of) not in values:
             option = f"--{name.replace('_', '-')}"
             raise InputError(f"{option} is an option of --{choice_of} {values[0]}; add that, or leave {option} out")
-    optimizer, rate = options.optimizer, None
-    if isinstance(options, Networks):
-        keywords = {name: getattr(options, name) for name in ("width", "depth", "activation", "field")}
-        rate = options.learning_rate
-    else:
-        keywords = {"degree": options.degree, "coordinates": options.coordinates}
-    networks = optimizer == "adam" or any(value is not None for value in keywords.values())
-    if isinstance(options, Recorded):
-        keywords["order"] = options.order
-    name = "gauss-newton" if optimizer == "auto" else optimizer
+    optimizer, names = options.optimizer, ("width", "depth", "activation", "field", "degree", "coordinates", "order")
+    keywords = {name: value for name in names if (value := getattr(options, name, None)) is not None}
+    networks = optimizer == "adam" or not keywords.keys() <= {"order"}
+    name, rate = "gauss-newton" if optimizer == "auto" else optimizer, getattr(options, "learning_rate", None)
     optimiser = optimiser_named(name, precision="f64", learning_rate=rate)
-    log = read(options)
+    if isinstance(options, Recorded):
+        noise = None if options.noise is None else numbers_of("--noise", options.noise, positive=True)
+        known = {"needs": needs_of(options.needs), "test": options.test, "noise": noise}
+        log = read_motions(options.task, options.data, **known, **facts(options))
+    else:
+        log = generate(options.task, getattr(options, "trajectories", None))
     if options.model == POLYNOMIAL:
         if optimizer == "adam":
             raise InputError("the polynomial model is one least-squares problem; leave --optimizer out")
@@ -234,18 +216,6 @@ def main(options: Options) -> None:
         if report.error:
             report = report._replace(error=f"{report.error}; {folder} holds the best model before that")
         finish(folder, options, report._replace(ended_by_user=options.steps is not None or fit.stop == "time"))
-
-
-def read(options: Options) -> "PhaseLog":
-    """The motions of the task."""
-    from dln_jax.commands.phase_spaces.data import generate, read_motions
-    from dln_jax.runs.arguments import facts, needs_of, numbers_of
-
-    if not isinstance(options, Recorded):
-        return generate(options.task, options.trajectories)
-    noise = None if options.noise is None else numbers_of("--noise", options.noise, positive=True)
-    known = {"needs": needs_of(options.needs), "test": options.test, "noise": noise}
-    return read_motions(options.task, options.data, **known, **facts(options))
 
 
 def lines_on(log: "PhaseLog", description: dict[str, Any]) -> Iterator[str]:

@@ -66,8 +66,7 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
     """
     import numpy as np
 
-    from dln_jax.commands.locomotion.figures import SHOWN, learning_figure, write_gait
-    from dln_jax.commands.locomotion.policies import NAME, judge, load_policy
+    from dln_jax.commands.locomotion import NAME, SHOWN, judge, learning_figure, load_policy, write_gait
     from dln_jax.locomotion.gradient import GradientSettings, shown_walk, train
     from dln_jax.locomotion.learning import GOAL, LANES, Goal, Record, evaluation_steps, median_to_reach
     from dln_jax.locomotion.perturbed import numbers_of, perturbed_trials
@@ -75,7 +74,7 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
     from dln_jax.locomotion.worlds import Variation
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
-    from dln_jax.runs.report import Report, finish, png
+    from dln_jax.runs.report import Report, finish, png, rows_of
     from dln_jax.runs.scaled import mesh_of
     from dln_jax.scale import device_lines, shares
     from dln_jax.softbody.terms.creature import TIME_STEP
@@ -167,5 +166,4 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
             "learning.png": png(learning_figure, curves),
             "gait.gif": lambda path: write_gait(path, task, seen, shown),
         }
-        rows = [(name.replace("_", " "), f"{value:.4g}") for name, value in metrics.items()]
-        finish(folder, options, Report(metrics, rows, title, ("quantity", "value"), lines=lines, figures=figures))
+        finish(folder, options, Report(metrics, rows_of(metrics), title, lines=lines, figures=figures))

@@ -105,6 +105,16 @@ def number(metric: str, value: int | float) -> str:
     return f"{value:,.2f}" if "share" in metric or metric.startswith("vpt") else f"{value:,.1f}"
 
 
+def rows_of(metrics: Mapping[str, float | int]) -> list[tuple[str, str, str]]:
+    """Rows of the printed table for metrics whose names say what they are, with the unit of times."""
+    return [(key.replace("_", " "), f"{value:.4g}", "s" if "seconds" in key else "") for key, value in metrics.items()]
+
+
+def one_step_metrics(latency: Latency) -> dict[str, float]:
+    """Latency metrics of single calls."""
+    return {"one_step_p50_us": latency.p50_us, "one_step_p99_us": latency.p99_us}
+
+
 def cost_metrics(training: Training, latency: Latency, *, parameters: int, best_step: int) -> dict[str, float | int]:
     """Costs of training a model and of its calls."""
     return {
@@ -113,6 +123,5 @@ def cost_metrics(training: Training, latency: Latency, *, parameters: int, best_
         "best_step": best_step,
         "compile_seconds": training.compile_seconds,
         "train_seconds": training.train_seconds,
-        "one_step_p50_us": latency.p50_us,
-        "one_step_p99_us": latency.p99_us,
+        **one_step_metrics(latency),
     }

@@ -9,7 +9,7 @@ import pytest
 from calls import assert_refused, command, json_of, one_line
 
 from dln_jax.commands import evaluate_locomotion, train_locomotion
-from dln_jax.commands.locomotion.policies import judge, load_policy
+from dln_jax.commands.locomotion import judge, load_policy
 from dln_jax.locomotion.learning import make_policy
 from dln_jax.locomotion.perturbed import Trials, numbers_of
 from dln_jax.locomotion.task import creature_named, make_task

@@ -8,8 +8,9 @@ from calls import assert_refused, command, exit_status, json_of, one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.commands import train_value
-from dln_jax.commands.values import plants, training
-from dln_jax.commands.values.training import verdict_of
+from dln_jax.commands.values import evaluation, plants
+from dln_jax.commands.values import run as training
+from dln_jax.commands.values.evaluation import verdict_of
 from dln_jax.control.optimal.action_costs import quadratic
 from dln_jax.control.optimal.fitted import Iteration
 from dln_jax.control.optimal.plants import Evaluation, Starts, ValuePlant, evaluate
@@ -101,9 +102,11 @@ def test_error_of_a_known_value_is_that_of_the_quadrature():
     network = value_network(problem)._replace(value_and_gradient=value)
     runs = evaluate(plant, lambda x: -x / 2, np.linspace(0.3, 0.9, 4)[:, None])
     for scale in (1.0, 1.2):
-        error = training.value_error(ValueRun("integrator", plant, network, scale), runs)
+        error = evaluation.value_error(ValueRun("integrator", plant, network, scale), runs)
         assert error == pytest.approx(scale - 1, abs=2e-3)
-    assert np.isnan(training.value_error(ValueRun("", plant, network, 1.0), runs._replace(settled=np.full(4, np.inf))))
+    assert np.isnan(
+        evaluation.value_error(ValueRun("", plant, network, 1.0), runs._replace(settled=np.full(4, np.inf)))
+    )
 
 
 def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys, rod):

@@ -9,7 +9,7 @@ from calls import assert_refused, command, exit_status, json_of, refused
 
 from dln_jax import InputError, build, describe
 from dln_jax.commands import swing_up
-from dln_jax.commands.swing_ups.any_plant import Learned
+from dln_jax.commands.swing_ups.learning import Learned
 from dln_jax.control.plants.exploring import Exploration, Explored, recording_of
 from dln_jax.control.plants.runs import PlantRun, Trials
 from dln_jax.control.plants.tuning import Tuned
@@ -22,7 +22,7 @@ MOTOR = "--actuated elbow --control 5"
 
 def test_a_run_stores_data_numbers_and_pictures(tmp_path, monkeypatch):
     # A known model needs no exploration by the laws of learned ones, which take a minute to compile.
-    monkeypatch.setattr("dln_jax.commands.swing_ups.desktop.Exploration", partial(Exploration, surplus=()))
+    monkeypatch.setattr("dln_jax.commands.swing_ups.learning.Exploration", partial(Exploration, surplus=()))
     few = "--plant furuta --model known --seconds-of-data 12 --starts 2 --estimator differences --out"
     command(swing_up, few, tmp_path / "run")
     found = json_of(tmp_path / "run/metrics.json")
@@ -75,7 +75,7 @@ def test_a_law_that_does_not_carry_over_to_the_plant_is_refused_with_the_reason(
         description = describe("planar-chain", precision="f64", needs=plant.layout.needs)
         fitted = FittedPlant(description, build(description).init(jax.random.key(0)))
         law = Tuned(None, "plan", {}, Regulator(np.zeros((1, 4)), np.zeros((4, 4))), 256, 1.0, 0.4, 1.4)
-        return Learned(None, None, fitted, law, 9.0)
+        return Learned(None, fitted, law, 9.0)
 
     few = Trials(np.array([np.inf, 1.0, np.inf]), ("'elbow' moves at 31/s",))
     place = "dln_jax.commands.swing_ups.run"

@@ -8,7 +8,7 @@ from calls import assert_refused, command, exit_status, json_of, refused
 
 from dln_jax import load
 from dln_jax.commands import train_diffnet
-from dln_jax.commands.functions.errors import verdict_of
+from dln_jax.commands.functions.networks import verdict_of
 from dln_jax.data import functions
 from dln_jax.learning import functions as regression
 from dln_jax.learning.engine import checkpoint

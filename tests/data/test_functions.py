@@ -10,8 +10,7 @@ from calls import one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax import fit
-from dln_jax.commands.functions.errors import errors, predict
-from dln_jax.commands.functions.units import layers_in_own_units, standard_units, to_units
+from dln_jax.commands.functions.networks import errors, layers_in_own_units, predict, standard_units, to_units
 from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples, published, published_grid
 from dln_jax.learning import functions as regression

@@ -1,5 +1,6 @@
 """Figures of learned functions: value, gradient and Hessian of truth and model with errors; spread of ensembles."""
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -69,9 +70,9 @@ def heat_maps(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
     for column, (symbol, (key, *index)) in zip(axes.T, COMPONENTS.items(), strict=True):
         exact, model = (_square(getattr(data, key)[(slice(None), 0, *index)]) for data in (truth, predicted))
         error, power = _scaled(model - exact)
-        largest, largest_error = (float(np.abs(values).max()) or 1e-300 for values in ([exact, model], error))
-        rows = (exact, largest, None), (model, largest, ""), (error, largest_error, power.strip(", "))
-        for axis, (values, size, label) in zip(column, rows, strict=True):
+        rows = (exact, [exact, model], None), (model, [exact, model], ""), (error, error, power.strip(", "))
+        for axis, (values, scaled, label) in zip(column, rows, strict=True):
+            size = float(np.abs(scaled).max()) or 1e-300
             norm = Normalize(-size, size)
             axis.pcolormesh(*grid, values, norm=norm, cmap=SIGNED, rasterized=True)
             axis.set_aspect("equal")
@@ -100,8 +101,11 @@ def surfaces(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
         exact, model = (_square(scalar(data)) for data in (truth, predicted))
         error, power = _scaled(abs(model - exact))
         limits = float(np.min([exact, model])), float(np.max([exact, model]))
-        panels = [(exact, "truth", limits), (model, "model", limits)]
-        panels += [(error, f"|error|{power}", (0.0, float(error.max()) or 1.0))]
+        panels = (
+            (exact, "truth", limits),
+            (model, "model", limits),
+            (error, f"|error|{power}", (0.0, error.max() or 1.0)),
+        )
         for column, (values, text, limits) in enumerate(panels):
             colours = POSITIVE if row == 1 or column == 2 else SIGNED
             axis = figure.add_subplot(len(scalars), 3, 3 * row + column + 1, projection="3d")
@@ -212,8 +216,8 @@ def training_figure(training: Training, trials: Sequence[Trial]) -> Figure:
         histories = [
             [at._replace(stage=f"width {trial.candidate.width}") for at in trial.outcome.history] for trial in trials
         ]
-        chosen = next(number for number, trial in enumerate(trials) if trial.outcome is training)
-        before = sum(history[-1].step for history in histories[:chosen])
+        earlier = itertools.takewhile(lambda trial: trial.outcome is not training, trials)
+        before = sum(trial.outcome.history[-1].step for trial in earlier)
     return training_curve(
         one_after_the_other(histories),
         best_step=before + training.best_step,

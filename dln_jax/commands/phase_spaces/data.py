@@ -157,19 +157,19 @@ def generate(name: str, trajectories: int | None = None) -> PhaseLog:
     """
     if name not in PROTOCOLS:
         raise InputError(f"task '{name}' is unknown; choose from {', '.join(TASKS)}")
-    known, number = TASKS[name], {} if trajectories is None else {"trajectories": trajectories}
-    made = PROTOCOLS[name](0, **number)
-    clean, t = made.test.clean, np.linspace(0.0, known.horizon, POINTS)
+    task = TASKS[name]
+    made = PROTOCOLS[name](0) if trajectories is None else PROTOCOLS[name](0, trajectories=trajectories)
+    clean, t = made.test.clean, np.linspace(0.0, task.horizon, POINTS)
     first = np.flatnonzero(np.diff(clean.trajectory, prepend=-1))[:STARTS]
-    q, p = clean.q[first], column(clean, "p")[first]
-    q, p = reference_motion(made.hamiltonian, q, p, t, dissipation=made.scene.dissipation)
+    starts = clean.q[first], column(clean, "p")[first]
+    motions = reference_motion(made.hamiltonian, *starts, t, dissipation=made.scene.dissipation)
     return PhaseLog(
         name,
-        known,
+        task,
         made.scene.needs,
         fitted=made.train.data,
         held_out=made.test.data._replace(**made.test.field._asdict()),
-        truth=(Motions(t, q, p),),
+        truth=(Motions(t, *motions),),
         energy=made.hamiltonian,
         published_energy=made.published_energy,
         exact=(made.train, made.test),
@@ -217,13 +217,11 @@ def read_motions(
         fitted, of_coordinates = with_rates(fitted, noise)
         held_out, _ = with_rates(held_out, noise)
     fitted, held_out = with_momenta(fitted), with_momenta(held_out)
-    parts = [
-        rows[at : at + 2 * task.window]
-        for rows in segments(fitted.t, fitted.trajectory)
-        for at in range(0, len(rows), 2 * task.window)
-    ]
-    index = np.arange(len(parts))
-    fitted = fitted._replace(trajectory=np.repeat(index, [len(part) for part in parts]), label=index.astype(str))
+    length = 2 * task.window
+    whole = segments(fitted.t, fitted.trajectory)
+    counts = [len(rows[at : at + length]) for rows in whole for at in range(0, len(rows), length)]
+    index = np.arange(len(counts))
+    fitted = fitted._replace(trajectory=np.repeat(index, counts), label=index.astype(str))
     p, present, whole = column(held_out, "p"), np.unique(held_out.trajectory), segments(held_out.t, held_out.trajectory)
     longest, tests, truth = HORIZON_WINDOWS * task.window, None, []
     if estimates and (of_coordinates is not None or max(map(len, whole)) > task.window):
@@ -254,10 +252,8 @@ def read_motions(
 
 def assumed_needs(data: Trajectories) -> Needs:
     """Prismatic coordinates if the measured forces balance as between bodies, else revolute joints with friction."""
-    d = data.degrees_of_freedom
-    if bodies_of(data) is not None:
-        return Needs(joints=("prismatic",) * d)
-    return Needs(joints=("revolute",) * d, friction=True)
+    d, turning = data.degrees_of_freedom, bodies_of(data) is None
+    return Needs(joints=("revolute" if turning else "prismatic",) * d, friction=turning)
 
 
 def bodies_of(data: Trajectories, order: Order | None = None) -> Bodies | None:
@@ -329,8 +325,7 @@ def with_rates(data: Trajectories, noise: tuple[float, ...] | None) -> tuple[Tra
 def with_momenta(data: Trajectories) -> Trajectories:
     """Adds p, by default qd, and pd, by default the rate of p; `estimated` names those that are not measured."""
     if data.p is None:
-        own = {"qd": "p", "qdd": "pd"}
-        estimated = [own[key] for key in data.estimated if key in own]
+        estimated = [own for key, own in (("qd", "p"), ("qdd", "pd")) if key in data.estimated]
         return data._replace(p=data.qd, pd=data.qdd, estimated=(*data.estimated, *estimated))
     if data.pd is None:
         pd = time_derivative(data.t, data.p, data.trajectory, name="pd")
@@ -350,18 +345,16 @@ def weights_of(data: Trajectories, noise: tuple[float, ...] | None) -> dict[str,
             return {}
         raise InputError(f"--noise is for motions, but no segment without a gap has {FEWEST} samples; leave it out")
     order = np.random.default_rng(0).permutation(len(parts))
-    count = int(np.searchsorted(np.cumsum([len(parts[index]) for index in order]), SURVEYED)) + 1
-    surveyed = select_samples(data, np.concatenate([parts[index] for index in sorted(order[:count])]))
+    count = np.searchsorted(np.cumsum([len(parts[index]) for index in order]), SURVEYED) + 1
+    surveyed = select_samples(data, np.sort(np.concatenate([parts[index] for index in order[:count]])))
     keys = ("q", "p", "qd", "pd")
     size = spreads(data, *keys)
     smoothed = [smooth_locally(surveyed._replace(q=column(surveyed, key))) for key in keys]
-    deviation = np.concatenate([smooth.noise for smooth in smoothed])
-    resolved = np.concatenate([smooth.resolved for smooth in smoothed])
+    deviation, resolved = (np.concatenate([getattr(smooth, of) for smooth in smoothed]) for of in ("noise", "resolved"))
     measured = np.repeat([key not in data.estimated for key in keys], d)
-    of_states = np.arange(4 * d) < 2 * d
-    least = np.where(of_states, FREE_OF_NOISE, LEAST_RATE_NOISE)
-    of_estimates = np.where(of_states, ANCHOR * size, np.inf)
-    limited = np.where(measured, np.maximum(deviation, least * size), of_estimates)
+    least = np.repeat([FREE_OF_NOISE, LEAST_RATE_NOISE], 2 * d) * size
+    of_estimates = np.repeat([ANCHOR, np.inf], 2 * d) * size
+    limited = np.where(measured, np.maximum(deviation, least), of_estimates)
     known = np.where(measured & resolved, deviation, 0.0)
     if noise is not None:
         stated = slice(0, max(d, len(noise)))

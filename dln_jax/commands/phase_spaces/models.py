@@ -55,8 +55,8 @@ def description_of(log: PhaseLog, model: str, *, order: Order | None = None, **s
         log: the data of the task.
         model: a name of the catalogue; "auto" for the one that suits the task, if it is not that of any plant.
         order: order of the coordinates of bodies (default: the one in which their forces balance).
-        stated: keywords of the model (width, depth, activation, degree, coordinates, field); those that are `None`
-            take the task's or the model's defaults.
+        stated: keywords of the model (width, depth, activation, degree, coordinates, field); others take the task's
+            or the model's defaults.
 
     Raises:
         InputError: a model of no phase space, or keywords that it does not have.
@@ -69,8 +69,8 @@ def description_of(log: PhaseLog, model: str, *, order: Order | None = None, **s
         raise InputError(f"model '{name}' is of no phase space; choose from auto, {known}")
     values: dict[str, Any] = {}
     if name not in (POLYNOMIAL, *LINEAR):
-        size = (task.width, task.depth) if name == task.suits else (task.network, task.network_depth)
-        values |= {"width": size[0], "depth": size[1], "activation": "tanh"}
+        width, depth = (task.width, task.depth) if name == task.suits else (task.network, task.network_depth)
+        values = {"width": width, "depth": depth, "activation": "tanh"}
         if needs.friction and name in ("separable-hnn", "structured-hnn"):
             values["friction_width"] = FRICTION_WIDTH
     # The model itself refuses other joints.
@@ -82,7 +82,7 @@ def description_of(log: PhaseLog, model: str, *, order: Order | None = None, **s
                 "body; state --order bodies (x1, y1, x2, y2) or --order axes (x1, x2, y1, y2), or take another model"
             )
         values |= bodies._asdict()
-    values |= {key: value for key, value in stated.items() if value is not None}
+    values |= stated
     if name == POLYNOMIAL and "degree" not in values:
         fitted, validation = hold_out(log.fitted, VALIDATION_SHARE, 0)
 

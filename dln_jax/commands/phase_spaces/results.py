@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import optax
 
 from dln_jax.commands.phase_spaces.data import PhaseLog, spreads
 from dln_jax.commands.phase_spaces.training import MOTIONS, RATES, PhaseFit
@@ -25,7 +26,7 @@ from dln_jax.metrics.phase_space import (
 )
 from dln_jax.metrics.predictions import on_grid, padded, predict_measured, prediction_metrics
 from dln_jax.metrics.verdict import judge_motions
-from dln_jax.runs.report import Report, png
+from dln_jax.runs.report import Report, one_step_metrics, png, unit_of
 from dln_jax.zoo.run import Run
 
 SUBSTEPS = 4
@@ -57,13 +58,9 @@ METRICS = {
     "train_loss": ("(qd, pd) at training states, mean square error", RATE_UNITS),
     "test_loss": ("(qd, pd) at test states, mean square error", RATE_UNITS),
     "clean_field_mse": ("(qd, pd) against the exact field, mean square error", RATE_UNITS),
-    "train_seconds": ("train seconds", "s"),
-    "compile_seconds": ("compile seconds", "s"),
-    "one_step_p50_us": ("one step p50 us", "µs"),
-    "one_step_p99_us": ("one step p99 us", "µs"),
     "validation_error": ("validation loss of the last stage", "see training.png"),
 }
-"""Label and unit of a metric by its name; other names explain themselves. The true plant has an energy error of 0."""
+"""Label and unit of a metric by its name; other names say them. The true plant has an energy error of 0."""
 UNITS = {"revolute": ("rad", "kg m²/s"), "prismatic": ("m", "kg m/s")}
 """Units of q and p."""
 
@@ -92,18 +89,14 @@ def evaluate(log: PhaseLog, fit: PhaseFit) -> Report:
         rates=unexplained,
     )
     latency = one_step(run.flow.rates, list(zip(truth.q[0, :256], truth.p[0, :256], strict=True)), calls=2000)
-    metrics = {
-        **errors(log, fit, predicted),
-        "one_step_p50_us": latency.p50_us,
-        "one_step_p99_us": latency.p99_us,
-    }
+    metrics = errors(log, fit, predicted) | one_step_metrics(latency)
     if log.noise is not None:
         metrics |= {f"q{joint}_noise": float(sd) for joint, sd in enumerate(np.ravel(log.noise.q), start=1)}
     metrics["validation_error"] = float(fit.training.validation)
     metrics = {key: value for key, value in metrics.items() if np.isfinite(value)}
     rows = []
     for key, value in metrics.items():
-        label, unit = METRICS.get(key, (key.replace("_", " "), ""))
+        label, unit = METRICS.get(key, (key.replace("_", " "), unit_of(key, {})))
         rows.append((label, f"{value:.4g}", unit))
     failed = fit.stop == "not finite"
     return Report(
@@ -151,10 +144,11 @@ def errors(log: PhaseLog, fit: PhaseFit, predicted: list[Motions]) -> dict[str, 
         trained, tested = (field_errors(model, parameters, part) for part in log.exact)
         numbers["train_loss"], numbers["test_loss"] = trained["loss"], tested["loss"]
         numbers["clean_field_mse"] = tested["clean_field_mse"]
-    numbers["train_seconds"] = fit.history[-1].seconds if fit.history else 0.0
-    numbers["compile_seconds"] = fit.compile_seconds
-    numbers["parameters"] = float(sum(leaf.size for leaf in jax.tree.leaves(parameters)))
-    return numbers
+    return numbers | {
+        "train_seconds": fit.history[-1].seconds if fit.history else 0.0,
+        "compile_seconds": fit.compile_seconds,
+        "parameters": float(optax.tree.size(parameters)),
+    }
 
 
 def predicted_motions(log: PhaseLog, fit: PhaseFit) -> list[Motions]:
@@ -163,8 +157,7 @@ def predicted_motions(log: PhaseLog, fit: PhaseFit) -> list[Motions]:
     if fit.velocities:
         windows = padded([on_grid(true.t, true.q[0], true.p[0]) for true in log.truth])
         moved = predict_measured(model, parameters, windows, fitted=samples_fitted(log, fit), substeps=SUBSTEPS)
-        kept = [np.flatnonzero(weight) for weight in windows.weight]
-        pairs = zip(log.truth, moved.q, moved.qd, kept, strict=True)
+        pairs = zip(log.truth, moved.q, moved.qd, windows.weight > 0, strict=True)
         return [Motions(true.t, q[None, rows], qd[None, rows]) for true, q, qd, rows in pairs]
     # All times are padded to one length, so that one program predicts all motions.
     longest = max(len(true.t) for true in log.truth)

@@ -84,8 +84,8 @@ def in_velocities(log: PhaseLog, description: Description) -> bool:
 
 def gauge_of(log: PhaseLog) -> Gauge:
     """The gauge: unit inertia with revolute joints at zero and prismatic joints at their mean."""
-    means = zip(log.needs.joints, log.fitted.q.mean(axis=0), strict=True)
-    return Gauge(tuple(0.0 if joint == "revolute" else float(mean) for joint, mean in means))
+    turning = np.array(log.needs.joints) == "revolute"
+    return Gauge(tuple(np.where(turning, 0.0, log.fitted.q.mean(axis=0)).tolist()))
 
 
 def mean_square_rates(log: PhaseLog, description: Description, data: Trajectories) -> float:

@@ -44,8 +44,7 @@ def injection_figure(model: ImageModel, parameters: Any, test: Films) -> Figure:
     # A motion with little energy, so that three times as much is within the decoder's training data.
     ranges = np.abs(test.q).max(axis=1)
     quiet = int(np.argsort(ranges)[len(ranges) // 4])
-    injection = inject_energy(model, parameters, test.pairs[quiet, 0], factor=3.0)
-    t, q, p = FRAME_TIME * injection.frames, injection.q, injection.p
+    t, q, p, pairs, level, physical = inject_energy(model, parameters, test.pairs[quiet, 0], factor=3.0)
     half, shown = len(t) // 2, 7
     figure = style.blank(height=5.0)
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.0, 1.05])[:, 0]
@@ -53,7 +52,7 @@ def injection_figure(model: ImageModel, parameters: Any, test: Films) -> Figure:
     rows = upper.subplots(2, shown, squeeze=False)
     for row, first, colour, name in zip(rows, (0, half), colours, ("before", "after"), strict=True):
         for axis, index in zip(row, np.linspace(first, first + half - 1, shown).astype(int), strict=True):
-            axis.imshow(injection.pairs[index, :PIXELS].reshape(SIDE, SIDE), cmap="gray", vmin=0, vmax=1)
+            axis.imshow(pairs[index, :PIXELS].reshape(SIDE, SIDE), cmap="gray", vmin=0, vmax=1)
             axis.set(xticks=[], yticks=[])
             style.title(axis, f"{t[index]:.2f} s", fontsize=style.SMALL, color=colour)
         row[0].set_ylabel(name, color=colour, fontsize=style.TEXT)
@@ -62,8 +61,8 @@ def injection_figure(model: ImageModel, parameters: Any, test: Films) -> Figure:
     style.prepare(plane, levels, joules)
     for part, colour in zip((slice(0, half), slice(half, None)), colours, strict=True):
         plane.plot(q[part], p[part], color=colour, linewidth=1.5)
-        levels.plot(t[part], injection.level[part], color=colour, linewidth=5.0, alpha=0.4)
-        joules.plot(t[part], injection.physical[part], ":", color="black", linewidth=1.6)
+        levels.plot(t[part], level[part], color=colour, linewidth=5.0, alpha=0.4)
+        joules.plot(t[part], physical[part], ":", color="black", linewidth=1.6)
     plane.annotate("", (q[half], p[half]), (q[half - 1], p[half - 1]), arrowprops={"arrowstyle": "->", "lw": 1.6})
     plane.set(xlabel="latent q, 1", ylabel="latent p, 1 per frame")
     style.title(plane, "path in the latent plane")
@@ -72,8 +71,8 @@ def injection_figure(model: ImageModel, parameters: Any, test: Films) -> Figure:
     joules.set_ylabel("energy of the frames, J")
     joules.grid(False)
     joules.spines["right"].set_visible(True)
-    start = injection.physical[:half].mean()
-    top = 1.25 * max(float(injection.level.max()), float(injection.physical.max() / start))
+    start = physical[:half].mean()
+    top = 1.25 * max(level.max(), physical.max() / start)
     levels.set_ylim(0.0, top)
     joules.set_ylim(0.0, top * start)
     return figure

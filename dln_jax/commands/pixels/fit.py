@@ -25,8 +25,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
-from jaxtyping import Float
+import optax
+from jaxtyping import Array, Float
 
 from dln_jax.commands.pixels.frames import PIXELS, Films, film_errors
 from dln_jax.learning.engine import fit as engine
@@ -119,15 +119,11 @@ def fit(
     description = describe("latent-phase", field=kind, pixels=PIXELS, components=COMPONENTS, precision="f32")
     model, scale = build(description), float(components["scale"])
     fitted, held_out = (jnp.asarray(windows_of(compress(components, part.frames))) for part in (train, validation))
-
-    def score(networks: Any) -> tuple[Scalar, Scalar]:
-        return unmonitored(loss(model.coefficients(networks, scale), held_out))
-
     problem = Problem(
         residual=None,
         parameters=jax.jit(model.init)(jax.random.key(seed))["parameters"],
         arrays=(fitted,),
-        score=score,
+        score=lambda networks: unmonitored(loss(model.coefficients(networks, scale), held_out)),
         seed=seed,
         loss=lambda networks, batch: loss(model.coefficients(networks, scale), *batch),
         loss_is_mean=False,  # the variance of a batch is not the mean of its parts' variances
@@ -141,16 +137,13 @@ def measure(
 ) -> tuple[dict[str, float], np.ndarray]:
     """Returns the test errors and costs of a fit, and its films from the starts of the test films."""
     model, components = build(description), parameters["components"]
-
-    def test_loss(networks: Any, windows: Array) -> Scalar:
-        return loss(model.coefficients(networks, float(components["scale"])), windows)
-
-    tested = jnp.asarray(windows_of(compress(components, test.frames)))
+    scale, tested = float(components["scale"]), jnp.asarray(windows_of(compress(components, test.frames)))
+    test_loss = jax.jit(lambda networks, windows: loss(model.coefficients(networks, scale), windows))
     numbers, films = film_errors(model, parameters, test)
     return {
         **numbers,
-        "test_loss": float(jax.jit(test_loss)(parameters["parameters"], tested)),
+        "test_loss": float(test_loss(parameters["parameters"], tested)),
         "train_seconds": training.train_seconds,
         "compile_seconds": training.compile_seconds,
-        "parameters": float(sum(leaf.size for leaf in jax.tree.leaves(parameters["parameters"]))),
+        "parameters": float(optax.tree.size(parameters["parameters"])),
     }, films

@@ -56,6 +56,8 @@ LENGTH, WIDTH, EXTENT, ABOVE = 1.0, 0.12, 1.6, 0.4
 GRID = 180
 """Number of initial angles of the search, around the circle; a Gauss-Newton step is at most their distance."""
 ITERATIONS = 20
+INJECTED = 50
+"""Frames before and after the energy of a motion is raised."""
 LATE = 1000 + np.arange(32.0)
 """Frame numbers of late predictions."""
 
@@ -101,7 +103,7 @@ class Films(NamedTuple):
 
 
 @in_float64
-def swinging_rod(trajectories: int = TRAJECTORIES, frames: int = FRAMES) -> tuple[Films, Films, Films]:
+def swinging_rod(trajectories: int = TRAJECTORIES, frames: int = FRAMES) -> list[Films]:
     """Generates the dataset: disjoint films for training, model selection and the test, always the same.
 
     States are integrated adaptively to 1e-10 in float64.
@@ -116,13 +118,11 @@ def swinging_rod(trajectories: int = TRAJECTORIES, frames: int = FRAMES) -> tupl
     qd = random.uniform(-LARGEST_VELOCITY, LARGEST_VELOCITY, (trajectories, 1))
     t = FRAME_TIME * np.arange(frames)
     q, qd = (state[..., 0] for state in rollouts(rod(), q, qd, t))
-    drawn = _films(jnp.asarray(q.ravel()))
-    data = q, qd, np.asarray(drawn).reshape(*q.shape, PIXELS)
+    data = q, qd, np.asarray(_films(jnp.asarray(q.ravel()))).reshape(*q.shape, PIXELS)
     validation, test = (max(1, round(share * trajectories)) for share in (VALIDATION, TEST))
     order = np.random.default_rng(0).permutation(trajectories)
     parts = np.split(order, [trajectories - validation - test, trajectories - test])
-    train, validation, test = (Films(t, *(array[np.sort(part)] for array in data)) for part in parts)
-    return train, validation, test
+    return [Films(t, *(array[np.sort(part)] for array in data)) for part in parts]
 
 
 @jax.jit
@@ -199,10 +199,8 @@ def film_errors(model: ImageModel, parameters: Any, test: Films) -> tuple[dict[s
     q, p = apply("encode", model, parameters, pairs)
     moved = move(q[:, 0], p[:, 0], np.arange(float(pairs.shape[1])))
     later = move(q[:, 0], p[:, 0], np.concatenate([[0.0], LATE]))
-    films, recoded, late = (
-        np.asarray(apply("decode", model, parameters, *states))
-        for states in ((moved.q, moved.p), (q, p), (later.q[:, 1:], later.p[:, 1:]))
-    )
+    states = (moved.q, moved.p), (q, p), (later.q[:, 1:], later.p[:, 1:])
+    films, recoded, late = (np.asarray(apply("decode", model, parameters, *state)) for state in states)
     true = energy(test.q, test.qd)[:, :-1]
     return {
         **summary("energy_mse", energy_errors(films, true)),
@@ -224,21 +222,6 @@ def judge_films(pairs: Float[np.ndarray, "K T input"], test: Films) -> Verdict:
     return judge_motions([predicted], [truth], size=size, bounded=np.ones(2, bool), fitted=2)
 
 
-class Injection(NamedTuple):
-    """One motion with as many frames before as after its energy is raised."""
-
-    frames: Float[np.ndarray, " T"]
-    """Frame numbers; that of the injection occurs twice."""
-    q: Float[np.ndarray, " T"]
-    p: Float[np.ndarray, " T"]
-    """Latent states."""
-    pairs: Float[np.ndarray, "T input"]
-    level: Float[np.ndarray, " T"]
-    """Latent H above rest, relative to its initial value."""
-    physical: Float[np.ndarray, " T"]
-    """Energy estimated from the frames, in J."""
-
-
 def raise_energy(H: Hamiltonian, q: Vector, p: Vector, wanted: Scalar) -> tuple[Vector, Vector]:
     """Moves (q, p) to H = wanted along dz/ds = grad H / |grad H|², which adds s to H where the gradient is not zero."""
 
@@ -258,9 +241,12 @@ def raise_energy(H: Hamiltonian, q: Vector, p: Vector, wanted: Scalar) -> tuple[
 
 @in_float64
 def inject_energy(
-    model: ImageModel, parameters: Any, pair: Float[np.ndarray, " input"], *, factor: float = 3.0, frames: int = 50
-) -> Injection:
-    """Predicts the motion from two frames, with `factor` times the energy after `frames` frames.
+    model: ImageModel, parameters: Any, pair: Float[np.ndarray, " input"], factor: float
+) -> tuple[np.ndarray, ...]:
+    """Predicts the motion from two frames, and as long with `factor` times the energy.
+
+    Returns times in s (that of the injection occurs twice), latent q and p, pairs of frames [T, input], the latent H
+    above rest relative to its initial value, and the energy estimated from the frames in J.
 
     H is relative to the rod at rest, whose latent state is the encoding of two frames of the hanging rod.
 
@@ -275,7 +261,7 @@ def inject_energy(
     still = np.tile(_films(jnp.zeros(1))[0], 2)
     q, p = (state[0] for state in apply("encode", model, parameters, np.stack([pair, still])[None]))
     first, ground = jax.vmap(H)(q, p)
-    t = np.arange(float(frames))
+    t = np.arange(float(INJECTED))
     move = functools.partial(predict, model.field, parameters["parameters"]["field"])
     before = move(q[:1], p[:1], t)
     ascend = jax.jit(functools.partial(raise_energy, H))
@@ -285,5 +271,5 @@ def inject_energy(
     q, p = (np.concatenate(halves, axis=1) for halves in ((before.q, after.q), (before.p, after.p)))
     pairs = np.asarray(apply("decode", model, parameters, q, p)[0])
     level = np.asarray((jax.vmap(H)(q[0], p[0]) - ground) / (first - ground))
-    physical = energy(*physical_states(pairs))
-    return Injection(np.concatenate([t, t[-1] + t]), q[0, :, 0], p[0, :, 0], pairs, level, physical)
+    times = FRAME_TIME * np.concatenate([t, t[-1] + t])
+    return times, q[0, :, 0], p[0, :, 0], pairs, level, energy(*physical_states(pairs))

@@ -69,11 +69,10 @@ def run_motion(prepared: PreparedScene, precision: Any) -> SimulatedMotion:
     params = example.scene.params
     start = state = in_precision(init(), precision)
 
-    def observe(state: State, info: Info) -> tuple[Any, Any, Info]:
-        return state.x, state.v, info
-
     def advance(state: State, params: Params, driven: Any) -> tuple[State, Any]:
-        return rollout(functools.partial(step, params), state, driven, observe=observe)
+        return rollout(
+            functools.partial(step, params), state, driven, observe=lambda state, info: (state.x, state.v, info)
+        )
 
     with progress(steps) as show:
         began = time.perf_counter()
@@ -97,22 +96,23 @@ def results(scene: str, mesh: Mesh, motion: SimulatedMotion) -> list[Row]:
     """Rows of report.json."""
     info, iterations = motion.info, motion.info.iterations
     ratios = [volume_ratios(x.astype(np.float64), mesh.vertices, mesh.nodes).min() for x in motion.x]
-    rows = [
-        Row(scene, "steps_per_second", motion.steps_per_second, "1/s"),
-        Row(scene, "compile_seconds", motion.compile_seconds, "s"),
-        Row(scene, "newton_iterations_mean", float(iterations.mean())),
-        Row(scene, "newton_iterations_max", float(iterations.max())),
-        Row(scene, "worst_residual_m_per_s2", float(info.residual.max()), "m/s²"),
-        Row(scene, "steps", float(len(info.converged))),
-        Row(scene, "steps_not_converged", float((~info.converged).sum()), bound=0.0),
-        Row(scene, "smallest_volume_ratio", float(np.min(ratios))),
-        Row(scene, "energy_created_J", float(np.sum(np.asarray(info.energy_growth))), "J"),
-    ]
+    rows: dict[str, Any] = {
+        "steps_per_second": (motion.steps_per_second, "1/s"),
+        "compile_seconds": (motion.compile_seconds, "s"),
+        "newton_iterations_mean": (iterations.mean(), "1"),
+        "newton_iterations_max": (iterations.max(), "1"),
+        "worst_residual_m_per_s2": (info.residual.max(), "m/s²"),
+        "steps": (len(info.converged), "1"),
+        "steps_not_converged": ((~info.converged).sum(), "1"),
+        "smallest_volume_ratio": (np.min(ratios), "1"),
+        "energy_created_J": (np.sum(np.asarray(info.energy_growth)), "J"),
+    }
     if info.overlaps is not None:
-        rows.append(Row(scene, "overlapping_components_max", float(info.overlaps.max())))
+        rows["overlapping_components_max"] = info.overlaps.max(), "1"
     if info.least_distance is not None:
-        rows.append(Row(scene, "least_distance_of_surfaces", float(info.least_distance.min()), "m"))
-    return rows
+        rows["least_distance_of_surfaces"] = info.least_distance.min(), "m"
+    bounds = {"steps_not_converged": 0.0}
+    return [Row(scene, name, float(value), unit, bound=bounds.get(name)) for name, (value, unit) in rows.items()]
 
 
 LABELS = {

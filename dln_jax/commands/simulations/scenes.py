@@ -60,7 +60,7 @@ def prepare(options: Arguments, name: str) -> PreparedScene:
     known = inspect.signature(scene).parameters
     names = ("cells", "dimension", "youngs_modulus", "poisson_ratio", "order", "mesh")
     choices: dict[str, Any] = {name: getattr(options, name) for name in names}
-    choices["strain_energy"] = None if options.material is None else MATERIALS[options.material]
+    choices["strain_energy"] = options.material and MATERIALS[options.material]
     choices |= {"mixed": options.mixed or None, "contact": options.contact or None}
     choices = {name: value for name, value in choices.items() if value is not None}
     if options.mixed and options.order != 2:

@@ -14,8 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from dln_jax.commands.sweeps.grid import pairs
-from dln_jax.commands.sweeps.job import SECONDS_BETWEEN_LOOKS, STATUS, Job, run_job, status_of
+from dln_jax.commands.sweeps.jobs import SECONDS_BETWEEN_LOOKS, STATUS, Job, pairs, run_job, status_of
 from dln_jax.files import write_json
 from dln_jax.types import InputError
 

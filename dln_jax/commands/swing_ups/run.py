@@ -9,8 +9,15 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from dln_jax.commands.swing_ups.any_plant import learn_to_swing_up, try_plant
-from dln_jax.commands.swing_ups.desktop import MODELS, errors_along, obtain, recorded, test_motions
+from dln_jax.commands.swing_ups.learning import (
+    MODELS,
+    errors_along,
+    learn_to_swing_up,
+    obtain,
+    recorded,
+    test_motions,
+    try_plant,
+)
 from dln_jax.control.closed_loop import ClosedLoopRun, Hardware, Outcomes, Push, hanging_starts
 from dln_jax.control.desktop_plants import (
     SECONDS,
@@ -48,7 +55,7 @@ from dln_jax.metrics.verdict import Verdict
 from dln_jax.runs.arguments import names_listed
 from dln_jax.runs.folder import command_folder
 from dln_jax.runs.progress import progress
-from dln_jax.runs.report import Report, finish, png
+from dln_jax.runs.report import Report, finish, png, rows_of
 from dln_jax.sizes import require_memory
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import save
@@ -152,10 +159,12 @@ def measured_traces(runs: list[PlantRun], layout: Layout) -> Figure:
     """Figure of some runs, with measurements in place of the states."""
     y = np.stack([run.y for run in runs])
     u = np.stack([run.u for run in runs])
-    shown = ClosedLoopRun(runs[0].t, np.concatenate([y, np.zeros_like(y)], axis=2), u[:, :-1], y)  # type: ignore[arg-type]
-    goal = np.concatenate([layout.goal, np.zeros_like(layout.goal)])
-    limits = tuple(layout.limits.control.T)
-    return closed_loop_traces(shown, layout.joints, names=layout.names, goal=goal, limits=limits)
+    x = np.concatenate([y, np.zeros_like(y)], axis=2)
+    shown = ClosedLoopRun(runs[0].t, x, u[:, :-1], y)  # type: ignore[arg-type]
+    goal = np.pad(layout.goal, (0, len(layout.goal)))
+    return closed_loop_traces(
+        shown, layout.joints, names=layout.names, goal=goal, limits=tuple(layout.limits.control.T)
+    )
 
 
 def of_desktop(desk: DesktopPlant, layout: Layout, options: Any, folder: Path) -> Report:
@@ -178,15 +187,14 @@ def of_desktop(desk: DesktopPlant, layout: Layout, options: Any, folder: Path) -
         save(folder, *obtained.fitted)
         print(f"learned: controls {late:.3g} sample(s) late, q filtered at {obtained.prepared.cutoff:.3g} Hz")
     torque, acceleration = errors_along(desk, model, test_motions(desk, seed=seed))
-    process = None
-    if options.estimator != "differences":
-        process = from_log(model, recording, actuation=B, delay=late).process
+    filtered = options.estimator != "differences"
+    process = from_log(model, recording, actuation=B, delay=late).process if filtered else None
     measured = estimator = estimator_of(options.estimator, layout, process, delay=late)
     law = law_of(desk, model, measured)
     if options.recover == "plans":
         upright = upright_for(desk, model)
-        scales = scales_of(upright, layout)
-        plans = recovering(upright, layout, scales, desk.numbers, law.regulator, desk.numbers.level)
+        numbers = desk.numbers
+        plans = recovering(upright, layout, scales_of(upright, layout), numbers, law.regulator, numbers.level)
         estimator = lambda _: measured(plans)  # noqa: E731
     push = push_at_half(layout, options.push, SECONDS)
     tried = try_starts(desk, model, starts=options.starts, seed=seed, estimator=estimator, push=push)
@@ -211,7 +219,7 @@ def draw(
     run = motion_of(desk, model, seconds=SHOWN if push is None else SECONDS, estimator=estimator, push=push)
     starts = hanging_starts(count, options.seed, position=desk.position)
     runs = jax.jit(jax.vmap(run))(starts, jax.random.split(jax.random.key(options.seed), count))
-    t, x, u = (np.asarray(array) for array in (runs.t[0], runs.x, runs.u))
+    t, x, u = (np.asarray(array) for array in (runs.t[0], runs.x[0], runs.u[0]))
     needs, sizes = desk.scene.needs, desk.sizes
     energy = passive_energy(without_friction(model), parts_of(needs.actuation), np.zeros(2))
     of_pole = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(runs.x)
@@ -224,7 +232,7 @@ def draw(
     write_figure(path, figure)
     last = int(np.searchsorted(t, FILMED if push is None else push.seconds + FILMED))
     film = path.with_name("swing-up.gif")
-    write_closed_loop_gif(film, drawing, t[:last], x[0, :last, :2], u[0, :last, 0], **shared)
+    write_closed_loop_gif(film, drawing, t[:last], x[:last, :2], u[:last, 0], **shared)
 
 
 def push_at_half(layout: Layout, rate: float, seconds: float) -> Push | None:
@@ -240,12 +248,8 @@ def report_of(
     figures: Mapping[str, Callable[[Path], None]],
 ) -> Report:
     """Numbers of swing-ups from many starts, and the verdict on the law."""
-    metrics = {
-        "success_share": outcomes.share,
-        "median_seconds": outcomes.median,
-        "worst_seconds": outcomes.worst,
-        **metrics,
-    }
+    times = {"median_seconds": outcomes.median, "worst_seconds": outcomes.worst}
+    metrics = {"success_share": outcomes.share, **times, **metrics}
     starts, pushed = len(outcomes.seconds), "" if push is None else f", pushed after {push.seconds:.3g} s"
     level, remedy = "good", ""
     if outcomes.share < 1:
@@ -253,9 +257,7 @@ def report_of(
         remedy = "record longer (--seconds-of-data), or widen the limits of the plant"
     return Report(
         metrics=metrics,
-        rows=[
-            (key.replace("_", " "), f"{value:.4g}", "s" if "seconds" in key else "") for key, value in metrics.items()
-        ],
+        rows=rows_of(metrics),
         title=f"swing-ups from {starts} starts",
         verdict=Verdict(level, f"{outcomes.share:.1%} of {starts} starts up after {seconds:.3g} s{pushed}", remedy),
         figures=figures,

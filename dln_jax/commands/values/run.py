@@ -1,25 +1,35 @@
 """A run of train_value: reads its options, trains or loads a value function, evaluates it and finishes the folder."""
 
 import dataclasses
-from collections.abc import Mapping
+import itertools
+import math
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
-from dln_jax.commands.values.figures import closed_loop, value_plane
+from dln_jax.commands.values.evaluation import closed_loop, evaluation, value_plane, verdict_of
 from dln_jax.commands.values.plants import of_file, of_run, problem_of, uncertain_numbers, with_factors
-from dln_jax.commands.values.training import by_equation, by_iteration, evaluation, verdict_of
-from dln_jax.control.optimal.fitted import Iteration
+from dln_jax.control.optimal.fitted import Iteration, IterationState, ValueProgress, fit_values
 from dln_jax.control.optimal.own_plants import described, own_settings
 from dln_jax.control.optimal.plants import FITS, ValuePlant, ValueSettings
-from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
+from dln_jax.control.optimal.problem import ControlProblem
+from dln_jax.control.optimal.residual import discounts_down_to, fit_hjb
+from dln_jax.control.optimal.value_networks import ValueNetwork
+from dln_jax.control.optimal.worst_case import Bounds, Disturbance, worst_disturbance
 from dln_jax.files import finite
+from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
+from dln_jax.learning.engine.problem import Progress
 from dln_jax.precision import with_float64
 from dln_jax.runs.arguments import names_listed, numbers_of, refuse_given, require_positive_if_given
 from dln_jax.runs.folder import command_folder
-from dln_jax.runs.report import Report, finish, png
+from dln_jax.runs.progress import progress
+from dln_jax.runs.report import Report, finish, png, rows_of
 from dln_jax.runs.scaled import mesh_of
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import load, save
@@ -40,6 +50,8 @@ ITERATIONS = 15
 """Gauss-Newton iterations per discount."""
 OF_RESIDUAL = ValueSettings((24, 24), Iteration(), 30.0)
 """Networks for the residual of a published plant."""
+ROUNDS = 6
+"""Number of resamplings at the problem's own discount."""
 
 
 def train(options: Any) -> None:
@@ -69,8 +81,8 @@ def train(options: Any) -> None:
         name = str(options.run or file)
         actuated, control = names_listed(options.actuated), positive_numbers(options, "control")
         control = control[0] if control is not None and len(control) == 1 else control
-        source, read = (file, of_file) if options.run is None else (options.run, of_run)
-        model, known, lacking = read(source, actuated, control, goal)
+        read = of_file if options.run is None else of_run
+        model, known, lacking = read(options.run or file, actuated, control, goal)
         problem = problem_of(
             model,
             known,
@@ -119,25 +131,23 @@ def train(options: Any) -> None:
                 network,
                 iteration,
                 seeds,
-                folder=folder,
-                identity=identity,
-                resume=options.resume,
+                lambda seed: Checkpoint(folder, {"settings": identity}, options.resume, f"checkpoint_seed_{seed}"),
                 mesh=mesh,
                 disturbance=disturbance,
             )
-        best = min(trained, key=lambda training: training.validation)
+        parameters, lowest, seconds = min(trained, key=lambda training: training[1])
         if model is not None:
             save(folder, model.description, model.parameters)
-        save_value(folder, name, goal, settings, best.parameters, problem)
-        metrics = {"train_seconds": best.train_seconds, "validation": best.validation}
+        save_value(folder, name, goal, settings, parameters, problem)
+        metrics = {"train_seconds": seconds, "validation": lowest}
         if len(trained) > 1:
-            validation = [training.validation for training in trained]
+            _, validation, spent = zip(*trained, strict=True)
             metrics |= {
                 "validation_median": float(np.median(validation)),
                 "validation_worst": float(np.max(validation)),
-                "train_seconds_median": float(np.median([training.train_seconds for training in trained])),
+                "train_seconds_median": float(np.median(spent)),
             }
-        run = ValueRun(name, plant, network, with_float64(best.parameters), problem)
+        run = ValueRun(name, plant, network, with_float64(parameters), problem)
         finish(folder, options, report_of(run, options, metrics, extremes))
 
 
@@ -161,9 +171,7 @@ def report_of(run: ValueRun, options: Any, numbers: Mapping[str, float], extreme
     numbers = {**numbers, **measured}
     return Report(
         metrics={**finite(numbers), "verdict": verdict.number},
-        rows=[
-            (key.replace("_", " "), f"{value:.4g}", "s" if "seconds" in key else "") for key, value in numbers.items()
-        ],
+        rows=rows_of(numbers),
         title=f"returns from {options.starts} starts hanging, and anywhere",
         verdict=verdict,
         figures={"value.png": png(value_plane, run), "closed-loop.png": png(closed_loop, run)},
@@ -182,11 +190,90 @@ def ranges_of(text: str) -> list[tuple[float, float]]:
     """Parses the ranges of --positions, such as -0.5:0.5,free."""
     ranges = []
     for part in text.split(","):
-        low, _, high = part.strip().replace("free", "-inf:inf").partition(":")
         try:
-            ranges.append((float(low), float(high)))
+            low, high = map(float, part.strip().replace("free", "-inf:inf").split(":"))
         except ValueError:
-            ranges.append((np.nan, np.nan))
-        if not ranges[-1][0] < ranges[-1][1]:
+            low = high = np.nan
+        if not low < high:
             raise InputError(f"--positions has {part!r:.40}; expected LOW:HIGH or free for every joint: -1:1,free")
+        ranges.append((low, high))
     return ranges
+
+
+def by_iteration(
+    problem: ControlProblem,
+    network: ValueNetwork,
+    numbers: Iteration,
+    seeds: range,
+    checkpoint: Callable[[int], Checkpoint],
+    *,
+    mesh: Mesh | None,
+    disturbance: Disturbance | None,
+) -> list[tuple[Any, float, float]]:
+    """Fits value functions by fitted value iteration, one per seed; devices share the states.
+
+    Every iteration is stored in the checkpoint of its seed; a stored seed is resumed bit for bit.
+    """
+    before = 0
+
+    def start(seed: int, state: IterationState) -> IterationState:
+        nonlocal before
+        before = numbers.iterations * (seed - seeds.start)
+        if (stored := restore(checkpoint(seed), state[:3])) is None:
+            return state
+        tree, history = stored
+        done = [ValueProgress(at.step, at.loss, at.validation, at.seconds) for at in history]
+        return IterationState(*tree, history=done)
+
+    def keep(seed: int, state: IterationState) -> None:
+        history = [Progress(at.iteration, at.loss, at.validation, math.nan, at.seconds, "") for at in state.history]
+        store(checkpoint(seed), state[:3], history)
+
+    with progress(len(seeds) * numbers.iterations, "iterations") as show:
+        fits = fit_values(
+            problem,
+            network,
+            seeds,
+            numbers=numbers,
+            mesh=mesh,
+            disturbance=disturbance,
+            report=lambda at: show(before + at.iteration, f"cost and misfit {at.validation:.4g}"),
+            restore=start,
+            store=keep,
+        )
+    return [
+        (fit.parameters, min(at.validation for at in fit.history), fit.train_seconds + fit.compile_seconds)
+        for fit in fits
+    ]
+
+
+def by_equation(
+    problem: ControlProblem,
+    network: ValueNetwork,
+    iterations: int,
+    seeds: range,
+    *,
+    mesh: Mesh | None,
+    disturbance: Disturbance | None,
+) -> list[tuple[Any, float, float]]:
+    """Fits one value function per seed by the Hamilton-Jacobi-Bellman residual; devices of a mesh share the samples."""
+    discounts, done = discounts_down_to(problem.discount), itertools.count(1)
+    trained = []
+    with progress(len(seeds) * (len(discounts) - 1 + ROUNDS), "iterations") as show:
+        for seed in seeds:
+            of_parameters, of_samples = jax.random.split(jax.random.key(seed))
+            began = time.perf_counter()
+            solution = fit_hjb(
+                problem,
+                network.value_and_gradient,
+                network.init(of_parameters),
+                of_samples,
+                discounts=discounts,
+                iterations=iterations,
+                rounds=ROUNDS,
+                mesh=mesh,
+                disturbance=disturbance,
+                report=lambda at: show(next(done), f"discount {at.discount:.3g}/s, residual {at.validation:.2e}"),
+            )
+            trained.append((solution.parameters, solution.validation, time.perf_counter() - began))
+    return trained

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from dln_jax.commands.functions.errors import errors, predict
+from dln_jax.commands.functions.networks import errors, predict
 from dln_jax.data.functions import FunctionSamples, SampleSplit, published, published_grid, split
 from dln_jax.learning.functions import GAUSS_NEWTON, WIDTHS, Network, grow_width, published_adam, train
 from dln_jax.nn import differential_mlp

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.commands.swing_ups.any_plant import SECONDS, Learned, learn_to_swing_up, try_plant
+from dln_jax.commands.swing_ups.learning import SECONDS, Learned, learn_to_swing_up, try_plant
 from dln_jax.control.closed_loop import Hardware
 from dln_jax.control.plants.mujoco_plants import mujoco_plant
 from dln_jax.control.plants.outside_loops import gymnasium_plant, hardware_plant

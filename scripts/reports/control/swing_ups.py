@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.commands.swing_ups.desktop import errors_along, obtain, recorded, test_motions
+from dln_jax.commands.swing_ups.learning import errors_along, obtain, recorded, test_motions
 from dln_jax.control.closed_loop import (
     ClosedLoopRun,
     Controller,

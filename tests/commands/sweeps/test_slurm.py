@@ -5,7 +5,7 @@ from calls import assert_refused, exit_status, refused
 
 from dln_jax.commands import sweep
 from dln_jax.commands.sweeps.executors import Requeued
-from dln_jax.commands.sweeps.job import Job, run_job
+from dln_jax.commands.sweeps.jobs import Job, run_job
 
 pytest.importorskip("submitit", reason="Slurm sweeps are submitted with submitit, of the extra [sweep]")
 PROGRAMS = {

@@ -18,8 +18,8 @@ from calls import assert_refused, command, exit_status, json_of, one_line, refus
 
 from dln_jax.commands import sweep
 from dln_jax.commands.sweeps import executors
-from dln_jax.commands.sweeps.job import Job, Status, run_job, status_of
-from dln_jax.commands.sweeps.table import compare, write_tables
+from dln_jax.commands.sweeps.jobs import Job, Status, run_job, status_of
+from dln_jax.commands.sweeps.results import compare, write_tables
 from dln_jax.data import schema
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.registry import scene_named

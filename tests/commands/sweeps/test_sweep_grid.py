@@ -3,7 +3,7 @@
 from calls import one_line
 
 from dln_jax.commands import check_data, train_delan, train_locomotion
-from dln_jax.commands.sweeps.grid import grid_of, jobs_of, pairs
+from dln_jax.commands.sweeps.jobs import grid_of, jobs_of, pairs
 
 
 def test_grid_of_a_text():

@@ -1,4 +1,7 @@
-"""Figures of a value function: a plane of V with its policy, and runs of the closed loop."""
+"""Evaluates the law of a value function: returns and the error of V, the verdict, and figures."""
+
+from collections.abc import Mapping
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -8,14 +11,77 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from dln_jax.control.closed_loop import ClosedLoopRun
-from dln_jax.control.optimal.plants import Returns, evaluate, starts
+from dln_jax.control.optimal.plants import Returns, ValuePlant, Where, evaluate, starts
 from dln_jax.figures import style
 from dln_jax.figures.closed_loops import angle_ticks, closed_loop_traces
+from dln_jax.metrics.verdict import Verdict
 from dln_jax.types import JointKind
 from dln_jax.zoo.value_functions import ValueRun
 
+FAILED, WRONG = 0.9, 0.1
+"""Share of the hanging starts that must end upright; a law below it is refused. Largest median error of a good V."""
 SHOWN, POINTS, LEVELS = 12, 121, 16
 """Number of runs drawn, of nodes along each side of the plane, and of contours of V."""
+
+
+def evaluation(run: ValueRun, count: int, altered: Mapping[str, ValuePlant]) -> dict[str, float]:
+    """Returns of a value function's law from both kinds of starts, and the error of V; a failed start counts as NaN.
+
+    Args:
+        count: number of starts of each kind.
+        altered: plants by name whose returns from near hanging are added.
+    """
+    numbers: dict[str, float] = {}
+    where: Where
+    for where in get_args(Where):
+        returns = evaluate(run.plant, run.law, starts(run.plant, where, count))
+        numbers |= summary(where, returns)
+        numbers["value_error"] = value_error(run, returns)
+    for name, plant in altered.items():
+        numbers |= summary(name, evaluate(plant, run.law, starts(run.plant, "down", count)))
+    return numbers
+
+
+def value_error(run: ValueRun, runs: Returns) -> float:
+    """Median error of V, relative to the discounted cost of following its law; NaN unless a start ends up.
+
+    Starts that are not up at the end of the evaluation are left out: their cost is not known.
+    """
+    problem, dt = run.problem, run.plant.evaluation.held / run.plant.evaluation.rate
+    costs = jax.vmap(jax.vmap(lambda x, u: problem.state_cost(x) + problem.action_cost.cost(u)))
+    weights = dt * np.exp(-problem.discount * dt * np.arange(runs.u.shape[1]))
+    V = jax.vmap(run.value_and_gradient)(jnp.asarray(runs.x[:, 0]))[0]
+    off = np.abs(V / (costs(runs.x[:, :-1], runs.u) @ weights) - 1)[np.isfinite(runs.settled)]
+    return float(np.median(off)) if len(off) else float("nan")
+
+
+def summary(name: str, runs: Returns) -> dict[str, float]:
+    """Numbers of the runs from one kind of starts."""
+    return {
+        f"{name}_return_mean": float(np.mean(runs.returns)),
+        f"{name}_return_median": float(np.median(runs.returns)),
+        f"{name}_return_worst": float(np.min(runs.returns)),
+        f"{name}_up_share": float(np.mean(np.isfinite(runs.settled))),
+        f"{name}_settled_median_seconds": float(np.median(runs.settled)),
+        f"{name}_control_most": runs.largest,
+    }
+
+
+def verdict_of(numbers: dict[str, float], count: int) -> Verdict:
+    """Verdict on a value function by the share of starts that its law brings upright, and the error of V."""
+    down, anywhere = numbers["down_up_share"], numbers["uniform_up_share"]
+    altered = [numbers[key] for key in ("heavy_weak_up_share", "light_strong_up_share") if key in numbers]
+    error = numbers.get("value_error", 0.0)
+    reason = f"{down:.0%} of {count} hanging starts end up, and {anywhere:.0%} of those anywhere at rest"
+    if altered:
+        reason += f"; {min(altered):.0%} of the hanging ones with the worst masses and motors"
+    reason += f"; V differs from the cost of its law by {error:.1%} in the median"
+    remedy = "train longer (--iterations) or with other --seeds, narrow the --box, or give a stronger motor"
+    if not down >= FAILED:
+        return Verdict("refused", reason, remedy)
+    # A robust V is that of the worst case, and exceeds the cost on the model.
+    sound = min(down, anywhere, *altered) == 1 and (error <= WRONG or bool(altered))
+    return Verdict("good", reason) if sound else Verdict("doubtful", reason, remedy)
 
 
 def hanging_runs(run: ValueRun) -> Returns:

@@ -1,13 +1,20 @@
-"""Results of a sweep: all jobs with their metrics, medians over seeds, and the best job, chosen by validation alone."""
+"""Results of a sweep: metrics of all jobs, medians over seeds, the best job by validation alone, and a figure."""
 
 import csv
 import io
 import statistics
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from dln_jax.commands.sweeps.job import METRICS, Job, status_of
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from dln_jax.commands.sweeps.jobs import METRICS, Job, status_of
+from dln_jax.figures import style
 from dln_jax.files import as_type, finite, is_file, read_json, write_bytes, write_json
 from dln_jax.runs.report import print_numbers
 from dln_jax.types import InputError
@@ -36,6 +43,13 @@ PROBLEM = [
 WIDTH = 200
 """Width of tables in columns. A narrow terminal wraps their lines, since truncated numbers would be useless."""
 MOST_ROWS = 200
+MOST_PANELS = 6
+"""Largest number of problems drawn in panels of their own."""
+MOST_COLOURS = 8
+"""Largest number of colours in the legend."""
+RUN: dict[str, Any] = {"markersize": 4, "markeredgewidth": 0, "alpha": 0.45, "zorder": 2}
+MEDIAN: dict[str, Any] = {"markersize": 8, "markeredgewidth": 0, "zorder": 3}
+BEST: dict[str, Any] = {"markersize": 13, "fillstyle": "none", "zorder": 4}
 
 
 def compare(
@@ -70,41 +84,44 @@ def compare(
                 metrics = finite(as_type(metrics, dict[str, float | None], name=str(path), remedy=remedy))
             except InputError as mistake:
                 status, metrics = status._replace(state="failed", line=str(mistake)), {}
-        values = {"job": job.folder.name, "values": dict(job.values), "best": False}
-        rows.append({**values, **status._asdict(), "metrics": metrics})
+        row = {"job": job.folder.name, "values": dict(job.values), "best": False}
+        rows.append(row | status._asdict() | {"metrics": metrics})
     known = list(dict.fromkeys(name for row in rows for name in row["metrics"]))
     for option, name in (("metric", metric), ("error", error)):
-        if known and name is not None and name not in known:
+        if known and name not in (None, *known):
             raise InputError(
                 f"--{option}: no job has the metric {name!r:.40}; choose from {', '.join(sorted(known))}. Jobs that "
                 f"are done are kept: --resume with another --{option} only makes the table"
             )
-    names = {kind: next((name for name in usual if name in known), None) for kind, usual in COMPARED.items()}
-    names |= {kind: name for kind, name in (("validation", metric), ("error", error)) if name is not None}
+    stated = {"validation": metric, "error": error}
+    names = {
+        kind: stated.get(kind) or next((name for name in usual if name in known), None)
+        for kind, usual in COMPARED.items()
+    }
     judge = names["validation"]
     chosen = [row for row in rows if row["metrics"].get(judge) is not None]
-    for rivals in classes(chosen, lambda row: problem_of(row["values"])):
+    for rivals in classes(chosen, lambda row: problem_of(row["values"])).values():
         if len(rivals) > 1:
             (max if largest else min)(rivals, key=lambda row: row["metrics"][judge])["best"] = True
     groups = []
-    for part in classes(rows, lambda row: [(name, text) for name, text in row["values"].items() if name not in over]):
+    others = classes(rows, lambda row: [(name, text) for name, text in row["values"].items() if name not in over])
+    for values, part in others.items():
         medians, worst = {}, {}
         for name in filter(None, names.values()):
             numbers = [number for row in part if (number := row["metrics"].get(name)) is not None]
             medians[name] = statistics.median(numbers) if numbers else None
             worst[name] = (min if largest and name == judge else max)(numbers, default=None)
-        values = {name: text for name, text in part[0]["values"].items() if name not in over}
         done = sum(row["state"] == "done" for row in part)
-        groups.append({"values": values, "done": done, "jobs": len(part), "medians": medians, "worst": worst})
+        groups.append({"values": dict(values), "done": done, "jobs": len(part), "medians": medians, "worst": worst})
     return {"names": names, "over": list(over), "metrics": known, "jobs": rows, "groups": groups}
 
 
-def classes(rows: Iterable[dict[str, Any]], key: Callable[[dict[str, Any]], Any]) -> list[list[dict[str, Any]]]:
-    """Rows with the same key, in the order of the rows."""
+def classes(rows: Iterable[dict[str, Any]], key: Callable[[dict[str, Any]], Any]) -> dict[Any, list[dict[str, Any]]]:
+    """Rows by their key, in the order of the rows."""
     groups: dict[Any, list[dict[str, Any]]] = {}
     for row in rows:
         groups.setdefault(tuple(key(row)), []).append(row)
-    return list(groups.values())
+    return groups
 
 
 def problem_of(values: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
@@ -149,8 +166,8 @@ def print_results(results: Mapping[str, Any], command: str, folder: Path) -> Non
         print(f"{names['error']} is of the test, and took no part in the choice")
     if missed:
         print(unfinished(rows))
-        for part in classes(missed, lambda row: (row["state"], row["line"])):
-            print(f"  {', '.join(row['job'] for row in part)} {part[0]['state']}: {part[0]['line']}")
+        for (state, line), part in classes(missed, lambda row: (row["state"], row["line"])).items():
+            print(f"  {', '.join(row['job'] for row in part)} {state}: {line}")
         print(f"--out {folder} --resume does them again")
     print(f"sweep: {folder}")
 
@@ -187,16 +204,85 @@ def _cell(text: str) -> str:
 
 def unfinished(rows: Sequence[Mapping[str, Any]]) -> str:
     """Counts of the jobs that are not done, by state; empty if all are done."""
-    states = [row["state"] for row in rows if row["state"] != "done"]
-    counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
+    states = Counter(row["state"] for row in rows if row["state"] != "done")
+    counts = ", ".join(f"{count} {state}" for state, count in states.items())
     return f"{len(rows)} jobs: {counts}" if states else ""
 
 
 def shortened(text: str) -> str:
     """A value for a table; a path is shortened to its last part."""
-    return text.rstrip("/").rpartition("/")[2]
+    return Path(text).name
 
 
 def spaced(name: str) -> str:
     """A metric or an option in words."""
     return name.replace("_", " ").replace("mse", "MSE")
+
+
+def sweep_figure(results: Mapping[str, Any], at_once: int | None) -> Figure | None:
+    """Draws error against training time, `at_once` jobs at once; `None` if no job has both.
+
+    Each problem has a panel, unless there are many. The first two options that no medians are taken over are shown by
+    colours and markers. Runs are faint if there are medians.
+    """
+    rows, over, names = results["jobs"], results["over"], results["names"]
+    shown = [(row["values"], row["metrics"], RUN if over else MEDIAN) for row in rows]
+    shown += [(row["values"], row["metrics"], BEST) for row in rows if row["best"]]
+    shown += [(group["values"], group["medians"], MEDIAN) for group in results["groups"] if over]
+    seconds, error = names["train_seconds"], names["error"]
+    points = [(values, numbers.get(seconds), numbers.get(error), size) for values, numbers, size in shown]
+    points = [point for point in points if None not in point[1:3]]
+    if not points:
+        return None
+    problems = list(dict.fromkeys(problem_of(row["values"]) for row in rows))
+    panels = len(problems) <= MOST_PANELS and len(problems) < len(rows)
+    options = [name for name in rows[0]["values"] if name not in (*over, *(PROBLEM if panels else ()))]
+    colour, marker = (*options, "", "")[:2]
+
+    def look(values: Mapping[str, str], name: str) -> str:
+        return shortened(values.get(name, ""))
+
+    kinds, forms = (list(dict.fromkeys(look(point[0], name) for point in points)) for name in (colour, marker))
+    colours = dict(zip(kinds, colormaps["viridis"](np.linspace(0, 0.95, len(kinds))), strict=True))
+    markers = {form: style.MARKERS[number % len(style.MARKERS)] for number, form in enumerate(forms)}
+
+    problems = problems if panels else [()]
+    columns = min(len(problems), 2)
+    lines = -(-len(problems) // columns)
+    figure, axes = style.figure(lines, columns, height=2.7 * lines + 1.1 if columns > 1 else 4.0)
+    for axis in axes.flat[len(problems) :]:
+        axis.axis("off")
+    for axis, problem in zip(axes.flat, problems, strict=False):
+        here = [point for point in points if not panels or problem_of(point[0]) == problem]
+        for values, x, y, size in here:
+            if size is BEST:
+                axis.plot(x, y, "o", color="black", **size)
+            else:
+                axis.plot(x, y, markers[look(values, marker)], color=colours[look(values, colour)], **size)
+        axis.set_xscale(style.scale_of(x for _, x, _, _ in here))
+        axis.set_yscale(style.scale_of(y for _, _, y, _ in here))
+        style.title(axis, ", ".join(f"{name} {shortened(text)}" for name, text in problem))
+    beside = "" if at_once is None else f", {at_once} jobs at once" if at_once > 1 else ", one job at a time"
+    work = seconds.removesuffix("_seconds").replace("train", "training")
+    for axis in axes.flat[max(0, len(problems) - columns) : len(problems)]:
+        axis.set_xlabel(f"{work}, s{beside}")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("test " * (error in COMPARED["error"]) + spaced(error))
+
+    def handle(marker: str, label: str, **looks: Any) -> Line2D:
+        return Line2D([], [], marker=marker, label=label, **{"linestyle": "", "color": "0.4", **looks})
+
+    handles = []
+    if colour:
+        few = kinds[:: -(-len(kinds) // MOST_COLOURS)]
+        handles += [handle("s", f"{spaced(colour)} {kind}", color=colours[kind]) for kind in few]
+    if marker:
+        handles += [handle(markers[form], f"{spaced(marker)} {form}") for form in forms]
+    if over:
+        handles += [handle("o", "a run", **RUN), handle("o", "median", **MEDIAN)]
+    if any(row["best"] for row in rows):
+        handles.append(handle("o", "best in validation", **{**BEST, "color": "black", "markersize": 10}))
+    if handles or unfinished(rows):
+        note = {"title": unfinished(rows) or None, "title_fontsize": style.SMALL}
+        style.legend(figure, handles=handles, loc="outside lower center", ncols=4, **note)
+    return figure

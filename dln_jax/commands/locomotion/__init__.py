@@ -1,1 +1,0 @@
-"""Policies of soft creatures: stored ones, their verdict, and figures of the learning and of the gait."""
