@@ -99,23 +99,8 @@ def phase_motion(
     field: Flow | PlainFlow, start: Array, t: Float[Array, " T"], *, substeps: int
 ) -> Float[Array, "T two_d"]:
     """States (q, p) at the times t from `start` [2 d], by RK4."""
-    d = start.shape[0] // 2
-    q, p = rollout(rk4(lambda t, state: field.rates(*state)), (start[:d], start[d:]), t, substeps=substeps)
-    return jnp.concatenate([q, p], axis=1)
-
-
-def window_residual(
-    field: Flow | PlainFlow, start: Array, window: tuple[Array, ...], *, weights: Weights, substeps: int
-) -> Array:
-    """Weighted residuals of one window (t, state, weight[, rate]); their squares sum to a mean over its samples."""
-    t, measured, weight, *rate = window
-    states = phase_motion(field, start, t, substeps=substeps)
-    errors = [(states - measured) / jnp.asarray(weights.state, start.dtype)]
-    if weights.rate is not None:
-        q, p = jnp.split(states, 2, axis=1)
-        rates = jnp.concatenate(jax.vmap(field.rates)(q, p), axis=1)
-        errors.append((rates - rate[0]) / jnp.asarray(weights.rate, start.dtype))
-    return weigh(weight, *errors)
+    first = tuple(jnp.split(start, 2))
+    return jnp.concatenate(rollout(rk4(lambda t, state: field.rates(*state)), first, t, substeps=substeps), axis=1)
 
 
 def weigh(weight: Array, *errors: Array) -> Array:
@@ -149,31 +134,31 @@ def phase_problem(
         InputError: no windows, weights that are not positive, or rates that the windows lack.
     """
     require_positive(substeps=substeps)
-    fitted, held_out = arrays(windows, validation, weights)
-    error = functools.partial(window_residual, weights=weights, substeps=substeps)
-
-    def residual(unknowns, index: Array, *window: Array) -> Array:
-        return error(flow(model.energies(unknowns["model"])), unknowns["starts"][index], window)
-
-    def closest(unknowns, *window: Array) -> Array:
-        from_start = functools.partial(error, flow(model.energies(unknowns["model"])), window=window)
-        return from_start(nearest(from_start, window[1][0]))
-
-    unknowns = {"model": parameters, "starts": fitted[1][:, 0]}
-    return selected_by(held_out, residual, unknowns, (jnp.arange(len(windows.t)), *fitted), seed, error=closest)
-
-
-def arrays(windows: Windows, validation: Windows, weights: Weights) -> list[tuple[Array, ...]]:
-    """Returns the arrays of both sets that a fit reads, on the device.
-
-    Raises:
-        InputError: as for `phase_problem`.
-    """
     require_windows(windows, validation, state_weight=weights.state, rate_weight=weights.rate)
     if weights.rate is not None and (windows.rate is None or validation.rate is None):
         raise InputError("the weights count rates, which the windows lack; leave their weight out")
     keys = ("t", "state", "weight", *(["rate"] if weights.rate is not None else []))
-    return [arrays_of(part, keys, jnp.result_type(float)) for part in (windows, validation)]
+    fitted, held_out = (arrays_of(part, keys, jnp.result_type(float)) for part in (windows, validation))
+
+    def error(unknowns: Any, window: tuple[Array, ...], start: Array) -> Array:
+        t, measured, weight, *rate = window
+        field = flow(model.energies(unknowns["model"]))
+        states = phase_motion(field, start, t, substeps=substeps)
+        errors = [(states - measured) / jnp.asarray(weights.state, start.dtype)]
+        if weights.rate is not None:
+            rates = jnp.concatenate(jax.vmap(field.rates)(*jnp.split(states, 2, axis=1)), axis=1)
+            errors.append((rates - rate[0]) / jnp.asarray(weights.rate, start.dtype))
+        return weigh(weight, *errors)
+
+    def residual(unknowns: Any, index: Array, *window: Array) -> Array:
+        return error(unknowns, window, unknowns["starts"][index])
+
+    def closest(unknowns: Any, *window: Array) -> Array:
+        from_start = functools.partial(error, unknowns, window)
+        return from_start(nearest(from_start, window[1][0]))
+
+    unknowns = {"model": parameters, "starts": fitted[1][:, 0]}
+    return selected_by(held_out, residual, unknowns, (jnp.arange(len(windows.t)), *fitted), seed, error=closest)
 
 
 def require_windows(windows: Any, validation: Any, **deviations: tuple[float, ...] | float | None) -> None:
@@ -272,17 +257,15 @@ def motion(
     substeps: int = 1,
 ) -> Float[Array, "T two_d"]:
     """States (q, qd) at the times t from `start`, by RK4, with or without torques."""
-    d = start.shape[0] // 2
-    driving = jnp.zeros((t.shape[0], d), start.dtype) if tau is None else tau
+    first = tuple(jnp.split(start, 2))
+    driving = jnp.zeros((len(t), len(first[0])), start.dtype) if tau is None else tau
 
     def rate(state: tuple[Array, Array], tau: Array) -> tuple[Array, Array]:
         q, qd = state
         return qd, system.forward_dynamics(q, qd, tau)
 
-    slopes = torque_slopes(driving, t, torque)
-    state, drive = (start[:d], start[d:]), (driving[:-1], slopes, jnp.diff(t))
-    q, qd = driven(rate, state, *drive, substeps=substeps, method=looped_rk4)
-    return jnp.concatenate([q, qd], axis=1)
+    drive = driving[:-1], torque_slopes(driving, t, torque), jnp.diff(t)
+    return jnp.concatenate(driven(rate, first, *drive, substeps=substeps, method=looped_rk4), axis=1)
 
 
 def measured_problem(
@@ -323,20 +306,28 @@ def measured_problem(
         _, q, qd, *_ = window
         return jnp.concatenate([q[0], qd[0], *([] if noise.tau is None else [jnp.zeros(d)])])
 
-    def error(system: Dynamics | PlainDynamics, start: Array, window: tuple[Array, ...]) -> Array:
-        return _measured_residual(system, start, window, noise=noise, torque=torque, substeps=substeps)
+    def error(system: Dynamics | PlainDynamics, window: tuple[Array, ...], start: Array) -> Array:
+        t, q, qd, tau, weight = window
+        push = start[2 * d :]
+        states = motion(
+            system, start[: 2 * d], t, tau if noise.tau is None else tau + push, torque=torque, substeps=substeps
+        )
+        errors = [(states[:, :d] - q) / jnp.asarray(noise.q)]
+        if noise.qd is not None:
+            errors.append((states[:, d:] - qd) / jnp.asarray(noise.qd))
+        left = weigh(weight, *errors)
+        return left if noise.tau is None else jnp.concatenate([left, push / jnp.asarray(noise.tau)])
 
     def residual(parameters: Parameters, *window: Array) -> Array:
-        frozen = dynamics(model.energies(jax.lax.stop_gradient(parameters)))
-        system = dynamics(model.energies(parameters))
+        frozen, system = (dynamics(model.energies(part)) for part in (jax.lax.stop_gradient(parameters), parameters))
         left = without_start(
-            lambda start: error(frozen, start, window), lambda start: error(system, start, window), first(window)
+            functools.partial(error, frozen, window), functools.partial(error, system, window), first(window)
         )
         return jnp.append(left, gauge_error(system, gauge))
 
     def closest(parameters: Parameters, *window: Array) -> Array:
-        system = dynamics(model.energies(parameters))
-        return error(system, nearest(lambda start: error(system, start, window), first(window)), window)
+        from_start = functools.partial(error, dynamics(model.energies(parameters)), window)
+        return from_start(nearest(from_start, first(window)))
 
     return selected_by(arrays_of(validation), residual, parameters, arrays_of(windows), seed, error=closest)
 
@@ -356,26 +347,5 @@ def gauge_error(system: Dynamics | PlainDynamics, gauge: Gauge | None) -> Float[
     """Distance of the mass matrix from the gauge, in units of `GAUGE_TOLERANCE` [1]; empty without either."""
     if gauge is None or not isinstance(system, Dynamics):
         return jnp.zeros(0)
-    M = system.mass_matrix(jnp.asarray(gauge.q))
-    return jnp.reshape(jnp.mean(jnp.diagonal(M)) / gauge.mass - 1, 1) / GAUGE_TOLERANCE
-
-
-def _measured_residual(
-    system: Dynamics | PlainDynamics,
-    start: Array,
-    window: tuple[Array, ...],
-    *,
-    noise: Noise,
-    torque: Torque,
-    substeps: int,
-) -> Array:
-    t, q, qd, tau, weight = window
-    d = q.shape[1]
-    start, push = start[: 2 * d], start[2 * d :]
-    pushed = tau if noise.tau is None else tau + push
-    states = motion(system, start, t, pushed, torque=torque, substeps=substeps)
-    errors = [(states[:, :d] - q) / jnp.asarray(noise.q)]
-    if noise.qd is not None:
-        errors.append((states[:, d:] - qd) / jnp.asarray(noise.qd))
-    residual = weigh(weight, *errors)
-    return residual if noise.tau is None else jnp.concatenate([residual, push / jnp.asarray(noise.tau)])
+    masses = jnp.diagonal(system.mass_matrix(jnp.asarray(gauge.q)))
+    return jnp.reshape(jnp.mean(masses) / gauge.mass - 1, 1) / GAUGE_TOLERANCE
