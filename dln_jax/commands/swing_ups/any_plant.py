@@ -15,7 +15,7 @@ from dln_jax.control.plants.runs import PlantRun, Trials, compiled, judged_runs,
 from dln_jax.control.plants.tuning import Tuned, tune
 from dln_jax.data.encoders.sampling import held_at_equal_steps, noise_of
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.weak_forms import FittedPlant, PreparedRecording, identified_chain, prepare
+from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified_chain, prepare
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import InputError, require_positive
 

@@ -15,7 +15,7 @@ from dln_jax.control.plants.exploring import Exploration, explore
 from dln_jax.control.state_space import field_of
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.engine.problem import ProgressReport, silent
-from dln_jax.learning.weak_forms import FittedPlant, PreparedRecording, identified, learned, prepare
+from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified, learned, prepare
 from dln_jax.mechanics.dynamics import Dynamics
 
 MODELS = ("delan", "identified", "analytic", "known")
