@@ -56,17 +56,37 @@ GAUGE_TOLERANCE = 0.01
 """Relative distance from a gauge that counts as one standard deviation; the fit meets the gauge exactly."""
 
 
-class Windows(NamedTuple):
+class MeasuredWindows(NamedTuple):
     """W windows of equal length; shorter ones repeat their last sample with weight zero."""
 
     t: np.ndarray
     """Time since the window's first sample [W, T], in s."""
-    state: np.ndarray
-    """Measured (q, p) [W, T, 2 d]."""
-    rate: np.ndarray | None
-    """Measured (qd, pd) [W, T, 2 d]."""
+    q: np.ndarray
+    """[W, T, d]."""
+    qd: np.ndarray
+    """[W, T, d], measured, or an estimate that only provides the initial start."""
+    tau: np.ndarray
+    """[W, T, d]."""
     weight: np.ndarray
     """1 for a sample, 0 for a repeated one [W, T]."""
+    p: np.ndarray | None = None
+    """[W, T, d], for a fit in coordinates and momenta."""
+    pd: np.ndarray | None = None
+    """[W, T, d]."""
+
+
+def cut_measured_windows(data: Trajectories, length: int) -> MeasuredWindows:
+    """Cuts consecutive windows of `length` samples; a window begins with the last sample of the one before.
+
+    Windows lie within segments without a gap. The remainder of a segment is a shorter window.
+
+    Raises:
+        InputError: a length below 2, or no two samples without a gap between them.
+    """
+    rows, weight = window_indices(data, length)
+    p, pd = (None if values is None else values[rows] for values in (data.p, data.pd))
+    t = data.t[rows]
+    return MeasuredWindows(t - t[:, :1], data.q[rows], data.qd[rows], data.tau[rows], weight, p, pd)
 
 
 class Weights(NamedTuple):
@@ -76,23 +96,6 @@ class Weights(NamedTuple):
     """Standard deviations of q and p, one number or 2 d; infinite for quantities that were not measured."""
     rate: tuple[float, ...] | float | None = None
     """Standard deviations of qd and pd, one number or 2 d; `None` leaves measured rates out."""
-
-
-def cut_windows(data: Trajectories, length: int) -> Windows:
-    """Cuts consecutive windows of `length` samples; a window begins with the last sample of the one before.
-
-    Windows lie within segments without a gap. The remainder of a segment is a shorter window.
-
-    Raises:
-        InputError: a length below 2, no momenta, or no two samples without a gap between them.
-    """
-    if data.p is None:
-        raise InputError("the data have no p; add momenta, or rates in their place (per unit of mass)")
-    indices, weight = window_indices(data, length)
-    state = np.concatenate([data.q, data.p], axis=1)[indices]
-    rate = None if data.pd is None else np.concatenate([data.qd, data.pd], axis=1)[indices]
-    t = data.t[indices]
-    return Windows(t - t[:, :1], state, rate, weight)
 
 
 def phase_motion(
@@ -112,8 +115,8 @@ def weigh(weight: Array, *errors: Array) -> Array:
 def phase_problem(
     model: Model,
     parameters: Parameters,
-    windows: Windows,
-    validation: Windows,
+    windows: MeasuredWindows,
+    validation: MeasuredWindows,
     *,
     weights: Weights,
     substeps: int = 4,
@@ -131,23 +134,26 @@ def phase_problem(
         substeps: RK4 steps between two samples.
 
     Raises:
-        InputError: no windows, weights that are not positive, or rates that the windows lack.
+        InputError: no windows, weights that are not positive, or momenta or rates that the windows lack.
     """
     require_positive(substeps=substeps)
     require_windows(windows, validation, state_weight=weights.state, rate_weight=weights.rate)
-    if weights.rate is not None and (windows.rate is None or validation.rate is None):
+    if windows.p is None or validation.p is None:
+        raise InputError("the data have no p; add momenta, or rates in their place (per unit of mass)")
+    if weights.rate is not None and (windows.pd is None or validation.pd is None):
         raise InputError("the weights count rates, which the windows lack; leave their weight out")
-    keys = ("t", "state", "weight", *(["rate"] if weights.rate is not None else []))
+    keys = "t", "weight", "q", "p", *(("qd", "pd") if weights.rate is not None else ())
     fitted, held_out = (arrays_of(part, keys, jnp.result_type(float)) for part in (windows, validation))
 
     def error(unknowns: Any, window: tuple[Array, ...], start: Array) -> Array:
-        t, measured, weight, *rate = window
+        t, weight, q, p, *rates = window
         field = flow(model.energies(unknowns["model"]))
         states = phase_motion(field, start, t, substeps=substeps)
-        errors = [(states - measured) / jnp.asarray(weights.state, start.dtype)]
+        errors = [(states - jnp.concatenate([q, p], axis=1)) / jnp.asarray(weights.state, start.dtype)]
         if weights.rate is not None:
-            rates = jnp.concatenate(jax.vmap(field.rates)(*jnp.split(states, 2, axis=1)), axis=1)
-            errors.append((rates - rate[0]) / jnp.asarray(weights.rate, start.dtype))
+            off = jnp.concatenate(jax.vmap(field.rates)(*jnp.split(states, 2, axis=1)), axis=1)
+            off = off - jnp.concatenate(rates, axis=1)
+            errors.append(off / jnp.asarray(weights.rate, start.dtype))
         return weigh(weight, *errors)
 
     def residual(unknowns: Any, index: Array, *window: Array) -> Array:
@@ -155,13 +161,17 @@ def phase_problem(
 
     def closest(unknowns: Any, *window: Array) -> Array:
         from_start = functools.partial(error, unknowns, window)
-        return from_start(nearest(from_start, window[1][0]))
+        _, _, q, p, *_ = window
+        return from_start(nearest(from_start, jnp.append(q[0], p[0])))
 
-    unknowns = {"model": parameters, "starts": fitted[1][:, 0]}
+    _, _, q, p, *_ = fitted
+    unknowns = {"model": parameters, "starts": jnp.concatenate([q[:, 0], p[:, 0]], axis=1)}
     return selected_by(held_out, residual, unknowns, (jnp.arange(len(windows.t)), *fitted), seed, error=closest)
 
 
-def require_windows(windows: Any, validation: Any, **deviations: tuple[float, ...] | float | None) -> None:
+def require_windows(
+    windows: MeasuredWindows, validation: MeasuredWindows, **deviations: tuple[float, ...] | float | None
+) -> None:
     """Raises `InputError` for a set without windows, or a standard deviation that is not positive."""
     for name, values in deviations.items():
         for deviation in np.ravel(values) if values is not None else ():
@@ -201,21 +211,6 @@ def _descend(residual: Callable[[Array], Array], start: Array, steps: int) -> tu
     return jax.lax.scan(step, (start, nothing), length=steps)[0]
 
 
-class MeasuredWindows(NamedTuple):
-    """W windows of equal length; shorter ones repeat their last sample with weight zero."""
-
-    t: np.ndarray
-    """Time since the window's first sample [W, T], in s."""
-    q: np.ndarray
-    """[W, T, d]."""
-    qd: np.ndarray
-    """[W, T, d], measured, or an estimate that only provides the initial start."""
-    tau: np.ndarray
-    """[W, T, d]."""
-    weight: np.ndarray
-    """1 for a sample, 0 for a repeated one [W, T]."""
-
-
 class Noise(NamedTuple):
     """Standard deviations of the measurements, one per coordinate or one for all."""
 
@@ -234,17 +229,6 @@ class Gauge(NamedTuple):
     """Position where the mass matrix is evaluated."""
     mass: float = 1.0
     """Mean of its diagonal there, kg m² or kg."""
-
-
-def cut_measured_windows(data: Trajectories, length: int) -> MeasuredWindows:
-    """Cuts consecutive windows of `length` samples within segments without a gap.
-
-    Raises:
-        InputError: a length below 2, or no two samples without a gap between them.
-    """
-    indices, weight = window_indices(data, length)
-    t = data.t[indices]
-    return MeasuredWindows(t - t[:, :1], data.q[indices], data.qd[indices], data.tau[indices], weight)
 
 
 def motion(
@@ -301,6 +285,7 @@ def measured_problem(
     d = windows.q.shape[2]
     require_windows(windows, validation, noise_q=noise.q, noise_qd=noise.qd, noise_tau=noise.tau)
     check_gauge(gauge, windows.tau, d)
+    fitted, held_out = (arrays_of(part, ("t", "q", "qd", "tau", "weight")) for part in (windows, validation))
 
     def first(window: tuple[Array, ...]) -> Array:
         _, q, qd, *_ = window
@@ -329,7 +314,7 @@ def measured_problem(
         from_start = functools.partial(error, dynamics(model.energies(parameters)), window)
         return from_start(nearest(from_start, first(window)))
 
-    return selected_by(arrays_of(validation), residual, parameters, arrays_of(windows), seed, error=closest)
+    return selected_by(held_out, residual, parameters, fitted, seed, error=closest)
 
 
 def check_gauge(gauge: Gauge | None, tau: np.ndarray, d: int) -> None:
