@@ -25,7 +25,7 @@ from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
-from dln_jax.learning.select import Trial
+from dln_jax.learning.select import Trial, lowest, select
 from dln_jax.mechanics.friction import FrictionShape, coefficients_of, unit_force
 from dln_jax.models.joint_friction import FrictionParameters
 from dln_jax.models.kernel import KernelParameters, KernelScales, States, torque_covariance
@@ -43,22 +43,10 @@ _REFUSED = 1e10
 """Objective of scales whose covariance is indefinite due to rounding."""
 
 
-class TorqueEquations(NamedTuple):
-    """Torques of samples, and the regressor of their friction."""
-
-    states: States
-    friction: Any
-    """Phi S [N d, P]."""
-    tau: Any
-    """[N, d]."""
-
-
-class Unknowns(NamedTuple):
-    """Logarithms of the scales and of the noise."""
-
-    scales: KernelScales
-    noise: Any
-    """[d]."""
+TorqueEquations = tuple[States, Any, Any]
+"""States of samples, the regressor Phi S [N d, P] of their friction, and their torques [N, d]."""
+Unknowns = tuple[KernelScales, Any]
+"""Logarithms of the scales and of the noise [d]."""
 
 
 class KernelFit(NamedTuple):
@@ -118,21 +106,20 @@ def fit_kernel(
         # S of a coefficient: 1 / (RMS torque of one unit of it, relative to the torques' deviations).
         sizes = np.sqrt(np.mean(np.sum((columns / unit[:, None]) ** 2, axis=1), axis=0))
         deviations = 1.0 / np.where(sizes > 0, sizes, 1.0)
-        every = _equations(train, columns * deviations, samples)
         some = _equations(train, columns * deviations, min(samples, likelihood_samples))
-        unknowns = likeliest(needs, serial, some, unit, iterations=iterations, least_noise=least_noise)
+        unknowns = _likeliest(needs, serial, some, unit, iterations=iterations, least_noise=least_noise)
         scales, noise = jax.tree.map(np.exp, unknowns)
-        covariance = np.array(compiled_covariance(needs.joints, serial)(scales, every.states))
-        covariance += every.friction @ every.friction.T
+        states, friction, tau = _equations(train, columns * deviations, samples)
+        covariance = np.array(compiled_covariance(needs.joints, serial)(scales, states)) + friction @ friction.T
         factor, noise = _factor(covariance, noise, unit)
-        weights = cho_solve(factor, every.tau.ravel())
-    coefficients = deviations * (every.friction.T @ weights)
+        weights = cho_solve(factor, tau.ravel())
+    coefficients = deviations * (friction.T @ weights)
     diagonal = np.log(np.diagonal(factor[0])).sum() + 0.5 * weights.size * np.log(2 * np.pi)
-    weights = weights.reshape(every.tau.shape)
+    weights = weights.reshape(tau.shape)
     return KernelFit(
-        parameters=_parameters(needs, scales, every.states, weights, coefficients),
+        parameters=_parameters(needs, scales, states, weights, coefficients),
         noise=noise,
-        likelihood=float(-(0.5 * np.vdot(every.tau, weights) + diagonal) / weights.size),
+        likelihood=float(-(0.5 * np.vdot(tau, weights) + diagonal) / weights.size),
         # The residual of the equations is noise² weights.
         torque_mse=float(np.mean(np.sum((noise**2 * weights) ** 2, axis=1))),
         samples=len(weights),
@@ -149,15 +136,16 @@ def choose_kernel(
     The candidate of a `Trial` is `serial`, its outcome the `KernelFit`; errors are relative to the joints' variances.
     Raises as `fit_kernel`.
     """
-    trials = []
-    for serial in (True, False):
-        fit = fit_kernel(needs, train, samples=samples, serial=serial)
-        with jax.enable_x64(True):
-            model = make("trigonometric-kernel", needs, samples=fit.samples, serial=serial)
-            scale = np.asarray(torque_scale(train))
-        errors = squared_torque_errors(model, fit.parameters, validation, scale)
-        trials.append(Trial(serial, fit, np.sum(errors, axis=1)))
-    return min(trials, key=lambda trial: trial.validation), trials
+    with jax.enable_x64(True):
+        scale = np.asarray(torque_scale(train))
+
+    def fit(serial: bool) -> tuple[KernelFit, Float[np.ndarray, " N"]]:
+        solution = fit_kernel(needs, train, samples=samples, serial=serial)
+        model = make("trigonometric-kernel", needs, samples=solution.samples, serial=serial)
+        errors = squared_torque_errors(model, solution.parameters, validation, scale)
+        return solution, np.sum(errors, axis=1)
+
+    return select((True, False), fit, rule=lowest)
 
 
 def _factor(
@@ -186,18 +174,20 @@ def _friction(needs: Needs, qd: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "
         raise InputError("friction by load multiplies what the energies give; leave load out, or train a network")
     lever = np.eye(d) if needs.joint_map is None else np.asarray(needs.joint_map).T
     shape = FrictionShape(velocity_scale=needs.velocity_scale)
-    names, rates = coefficients_of(needs.joint_friction), jnp.asarray(qd @ lever)
-    units = [jax.vmap(lambda u, name=name: unit_force(name, u, shape))(rates) for name in names]
-    columns = [lever * np.asarray(unit)[:, None, :] for unit in units]
-    if needs.friction:
-        columns.insert(0, np.eye(d) * qd[:, None, :])
-    return np.concatenate([np.zeros((len(qd), d, 0)), *columns], axis=2)
+    rates = jnp.asarray(qd @ lever)
+    own = [np.eye(d) * qd[:, None, :]] if needs.friction else []
+    units = [
+        jax.vmap(functools.partial(unit_force, name, shape=shape))(rates)
+        for name in coefficients_of(needs.joint_friction)
+    ]
+    of_laws = [lever * np.asarray(unit)[:, None, :] for unit in units]
+    return np.concatenate([np.zeros((len(qd), d, 0)), *own, *of_laws], axis=2)
 
 
 def _equations(data: Trajectories, friction: Float[np.ndarray, "N d P"], most: int) -> TorqueEquations:
     rows = np.unique(np.round(np.linspace(0, len(data.tau) - 1, min(most, len(data.tau)))).astype(int))
-    states = States(*(np.asarray(array[rows], float) for array in (data.q, data.qd, data.qdd)))
-    return TorqueEquations(states, friction[rows].reshape(data.tau[rows].size, -1), np.asarray(data.tau[rows], float))
+    q, qd, qdd, tau = (np.asarray(array[rows], float) for array in (data.q, data.qd, data.qdd, data.tau))
+    return (q, qd, qdd), friction[rows].reshape(tau.size, -1), tau
 
 
 def _parameters(needs: Needs, scales: KernelScales, states: States, weights: np.ndarray, friction: np.ndarray) -> Any:
@@ -211,14 +201,14 @@ def _parameters(needs: Needs, scales: KernelScales, states: States, weights: np.
     return {"model": kernel, "friction": FrictionParameters(coefficients, {})}
 
 
-def likeliest(
+def _likeliest(
     needs: Needs, serial: bool, equations: TorqueEquations, unit: np.ndarray, *, iterations: int, least_noise: float
 ) -> Unknowns:
     """Returns the scales and noise that maximise the marginal likelihood."""
     from scipy.optimize import minimize
 
-    unknowns = Unknowns(start_of(needs, serial, equations, unit), np.log(FIRST_NOISE * unit))
-    start, unknowns_of = ravel_pytree(unknowns)
+    first = start_of(needs, serial, equations, unit), np.log(FIRST_NOISE * unit)
+    start, unknowns_of = ravel_pytree(first)
     evaluate = jax.jit(likelihood(needs.joints, serial), compiler_options=quick_compilation())
 
     def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -239,21 +229,22 @@ def likelihood(joints: tuple[JointKind, ...], serial: bool) -> Callable[[Unknown
 
     def evaluate(unknowns: Unknowns, equations: TorqueEquations) -> Any:
         states, friction, tau = equations
-        count = tau.size
+        logarithms, noise = unknowns
 
-        def covariance(scales: KernelScales) -> Any:
-            return torque_covariance(joints, serial, jax.tree.map(jnp.exp, scales), states)
+        def covariance(logarithms: KernelScales) -> Any:
+            return torque_covariance(joints, serial, jax.tree.map(jnp.exp, logarithms), states)
 
-        variance = jnp.exp(2 * unknowns.noise)
-        noise = jnp.tile(variance, len(tau))
-        lower = jnp.linalg.cholesky(covariance(unknowns.scales) + friction @ friction.T + jnp.diag(noise))
-        inverse = jax.scipy.linalg.cho_solve((lower, True), jnp.eye(count, dtype=lower.dtype))
+        variance = jnp.exp(2 * noise)
+        lower = jnp.linalg.cholesky(
+            covariance(logarithms) + friction @ friction.T + jnp.diag(jnp.tile(variance, len(tau)))
+        )
+        inverse = jax.scipy.linalg.cho_solve((lower, True), jnp.eye(tau.size, dtype=lower.dtype))
         weights = inverse @ tau.ravel()
         value = 0.5 * tau.ravel() @ weights + jnp.sum(jnp.log(jnp.diagonal(lower)))
         W = 0.5 * (inverse - jnp.outer(weights, weights))
-        scales = jax.grad(lambda scales: jnp.vdot(W, covariance(scales)))(unknowns.scales)
-        by_joint = 2 * variance * jnp.sum(jnp.diagonal(W).reshape(tau.shape), axis=0)
-        return value / count, jax.tree.map(lambda slope: slope / count, Unknowns(scales, by_joint))
+        by_scale = jax.grad(lambda logarithms: jnp.vdot(W, covariance(logarithms)))(logarithms)
+        by_noise = 2 * variance * jnp.sum(jnp.diagonal(W).reshape(tau.shape), axis=0)
+        return jax.tree.map(lambda total: total / tau.size, (value, (by_scale, by_noise)))
 
     return evaluate
 
@@ -263,34 +254,28 @@ def start_of(needs: Needs, serial: bool, equations: TorqueEquations, unit: np.nd
 
     A randomly rotated vector keeps on average a third of its squared length along the joint's axis.
     """
-    d = needs.degrees_of_freedom
-    bodies = d if serial else 1
-    q, _, qdd = (np.sqrt(np.mean(array**2, axis=0)) for array in equations.states)
+    (states, *_), d = equations, needs.degrees_of_freedom
+    ones = np.ones(d if serial else 1)
+    q, _, qdd = (np.sqrt(np.mean(array**2, axis=0)) for array in states)
     slides = np.array([joint == "prismatic" for joint in needs.joints])
-    rotated = np.tile([1 / 3, 2 / 3], (d, 1))
     slid = np.stack([np.full(d, 2 / 3), 1 / (3 * np.where(q > 0, q, 1.0) ** 2)], axis=1)
-    pairs = np.where(slides[:, None], slid, rotated)
+    pairs = np.where(slides[:, None], slid, [1 / 3, 2 / 3])
     rates = unit / np.where(qdd > 0, qdd, 1.0)
-    ones, none = np.ones(bodies), np.zeros(bodies)
     scales = KernelScales(rates / rates.mean(), ones, pairs, *((ones, pairs) if needs.gravity else (None, None)))
-    few = States(*(array[:: max(1, len(array) // FEW)] for array in equations.states))
+    few = tuple(array[:: max(1, len(array) // FEW)] for array in states)
 
     def size(scales: KernelScales) -> float:
         """Mean variance of torques in units of the measured ones; 1 if nothing moves."""
         variance = np.diagonal(compiled_covariance(needs.joints, serial)(scales, few)).reshape(-1, d)
         return float(np.mean(variance / unit**2)) or 1.0
 
-    without = scales._replace(weight=none if needs.gravity else None)
-    scales = scales._replace(inertia=ones * 0.5 / size(without))
+    inertia = ones * 0.5 / size(scales._replace(weight=0 * ones) if needs.gravity else scales)
     if needs.gravity:
-        scales = scales._replace(weight=ones / size(scales._replace(inertia=none)))
-    return jax.tree.map(np.log, scales)
+        scales = scales._replace(weight=ones / size(scales._replace(inertia=0 * ones)))
+    return jax.tree.map(np.log, scales._replace(inertia=inertia))
 
 
 @functools.lru_cache(maxsize=4)
 def compiled_covariance(joints: tuple[JointKind, ...], serial: bool) -> Callable[..., Any]:
     """(scales, states) -> `torque_covariance`."""
-    return jax.jit(
-        lambda scales, states: torque_covariance(joints, serial, scales, states),
-        compiler_options=quick_compilation(),
-    )
+    return jax.jit(functools.partial(torque_covariance, joints, serial), compiler_options=quick_compilation())

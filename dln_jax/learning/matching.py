@@ -134,15 +134,12 @@ def accelerations_problem(
     def residual(parameters: Parameters, *sample: Array) -> Array:
         return jnp.append(error(parameters, *sample), gauge_error(dynamics(model.energies(parameters)), gauge))
 
-    fitted, held_out = (
-        arrays_of(select_samples(part, _drawn(len(part.t), most_samples, seed)), TORQUE.keys)
-        for part in (data, validation)
-    )
+    def drawn(part: Trajectories) -> tuple[Array, ...]:
+        samples = len(part.t)
+        if samples > most_samples:
+            rows = np.random.default_rng(seed).choice(samples, size=most_samples, replace=False)
+            part = select_samples(part, np.sort(rows))
+        return arrays_of(part, TORQUE.keys)
+
+    fitted, held_out = map(drawn, (data, validation))
     return selected_by(held_out, residual, parameters, fitted, seed, error=error)
-
-
-def _drawn(samples: int, most: int, seed: int) -> np.ndarray:
-    """Indices of `most` random samples in ascending order, or of all samples if there are no more than that."""
-    if samples <= most:
-        return np.arange(samples)
-    return np.sort(np.random.default_rng(seed).choice(samples, size=most, replace=False))

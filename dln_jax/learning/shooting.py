@@ -56,17 +56,37 @@ GAUGE_TOLERANCE = 0.01
 """Relative distance from a gauge that counts as one standard deviation; the fit meets the gauge exactly."""
 
 
-class Windows(NamedTuple):
+class MeasuredWindows(NamedTuple):
     """W windows of equal length; shorter ones repeat their last sample with weight zero."""
 
     t: np.ndarray
     """Time since the window's first sample [W, T], in s."""
-    state: np.ndarray
-    """Measured (q, p) [W, T, 2 d]."""
-    rate: np.ndarray | None
-    """Measured (qd, pd) [W, T, 2 d]."""
+    q: np.ndarray
+    """[W, T, d]."""
+    qd: np.ndarray
+    """[W, T, d], measured, or an estimate that only provides the initial start."""
+    tau: np.ndarray
+    """[W, T, d]."""
     weight: np.ndarray
     """1 for a sample, 0 for a repeated one [W, T]."""
+    p: np.ndarray | None = None
+    """[W, T, d], for a fit in coordinates and momenta."""
+    pd: np.ndarray | None = None
+    """[W, T, d]."""
+
+
+def cut_measured_windows(data: Trajectories, length: int) -> MeasuredWindows:
+    """Cuts consecutive windows of `length` samples; a window begins with the last sample of the one before.
+
+    Windows lie within segments without a gap. The remainder of a segment is a shorter window.
+
+    Raises:
+        InputError: a length below 2, or no two samples without a gap between them.
+    """
+    rows, weight = window_indices(data, length)
+    p, pd = (None if values is None else values[rows] for values in (data.p, data.pd))
+    t = data.t[rows]
+    return MeasuredWindows(t - t[:, :1], data.q[rows], data.qd[rows], data.tau[rows], weight, p, pd)
 
 
 class Weights(NamedTuple):
@@ -78,44 +98,12 @@ class Weights(NamedTuple):
     """Standard deviations of qd and pd, one number or 2 d; `None` leaves measured rates out."""
 
 
-def cut_windows(data: Trajectories, length: int) -> Windows:
-    """Cuts consecutive windows of `length` samples; a window begins with the last sample of the one before.
-
-    Windows lie within segments without a gap. The remainder of a segment is a shorter window.
-
-    Raises:
-        InputError: a length below 2, no momenta, or no two samples without a gap between them.
-    """
-    if data.p is None:
-        raise InputError("the data have no p; add momenta, or rates in their place (per unit of mass)")
-    indices, weight = window_indices(data, length)
-    state = np.concatenate([data.q, data.p], axis=1)[indices]
-    rate = None if data.pd is None else np.concatenate([data.qd, data.pd], axis=1)[indices]
-    t = data.t[indices]
-    return Windows(t - t[:, :1], state, rate, weight)
-
-
 def phase_motion(
     field: Flow | PlainFlow, start: Array, t: Float[Array, " T"], *, substeps: int
 ) -> Float[Array, "T two_d"]:
     """States (q, p) at the times t from `start` [2 d], by RK4."""
-    d = start.shape[0] // 2
-    q, p = rollout(rk4(lambda t, state: field.rates(*state)), (start[:d], start[d:]), t, substeps=substeps)
-    return jnp.concatenate([q, p], axis=1)
-
-
-def window_residual(
-    field: Flow | PlainFlow, start: Array, window: tuple[Array, ...], *, weights: Weights, substeps: int
-) -> Array:
-    """Weighted residuals of one window (t, state, weight[, rate]); their squares sum to a mean over its samples."""
-    t, measured, weight, *rate = window
-    states = phase_motion(field, start, t, substeps=substeps)
-    errors = [(states - measured) / jnp.asarray(weights.state, start.dtype)]
-    if weights.rate is not None:
-        q, p = jnp.split(states, 2, axis=1)
-        rates = jnp.concatenate(jax.vmap(field.rates)(q, p), axis=1)
-        errors.append((rates - rate[0]) / jnp.asarray(weights.rate, start.dtype))
-    return weigh(weight, *errors)
+    first = tuple(jnp.split(start, 2))
+    return jnp.concatenate(rollout(rk4(lambda t, state: field.rates(*state)), first, t, substeps=substeps), axis=1)
 
 
 def weigh(weight: Array, *errors: Array) -> Array:
@@ -127,8 +115,8 @@ def weigh(weight: Array, *errors: Array) -> Array:
 def phase_problem(
     model: Model,
     parameters: Parameters,
-    windows: Windows,
-    validation: Windows,
+    windows: MeasuredWindows,
+    validation: MeasuredWindows,
     *,
     weights: Weights,
     substeps: int = 4,
@@ -146,37 +134,44 @@ def phase_problem(
         substeps: RK4 steps between two samples.
 
     Raises:
-        InputError: no windows, weights that are not positive, or rates that the windows lack.
+        InputError: no windows, weights that are not positive, or momenta or rates that the windows lack.
     """
     require_positive(substeps=substeps)
-    fitted, held_out = arrays(windows, validation, weights)
-    error = functools.partial(window_residual, weights=weights, substeps=substeps)
+    require_windows(windows, validation, state_weight=weights.state, rate_weight=weights.rate)
+    if windows.p is None or validation.p is None:
+        raise InputError("the data have no p; add momenta, or rates in their place (per unit of mass)")
+    if weights.rate is not None and (windows.pd is None or validation.pd is None):
+        raise InputError("the weights count rates, which the windows lack; leave their weight out")
+    keys = "t", "weight", "q", "p", *(("qd", "pd") if weights.rate is not None else ())
+    fitted, held_out = (arrays_of(part, keys, jnp.result_type(float)) for part in (windows, validation))
 
-    def residual(unknowns, index: Array, *window: Array) -> Array:
-        return error(flow(model.energies(unknowns["model"])), unknowns["starts"][index], window)
+    def error(unknowns: Any, window: tuple[Array, ...], start: Array) -> Array:
+        t, weight, q, p, *rates = window
+        field = flow(model.energies(unknowns["model"]))
+        states = phase_motion(field, start, t, substeps=substeps)
+        errors = [(states - jnp.concatenate([q, p], axis=1)) / jnp.asarray(weights.state, start.dtype)]
+        if weights.rate is not None:
+            off = jnp.concatenate(jax.vmap(field.rates)(*jnp.split(states, 2, axis=1)), axis=1)
+            off = off - jnp.concatenate(rates, axis=1)
+            errors.append(off / jnp.asarray(weights.rate, start.dtype))
+        return weigh(weight, *errors)
 
-    def closest(unknowns, *window: Array) -> Array:
-        from_start = functools.partial(error, flow(model.energies(unknowns["model"])), window=window)
-        return from_start(nearest(from_start, window[1][0]))
+    def residual(unknowns: Any, index: Array, *window: Array) -> Array:
+        return error(unknowns, window, unknowns["starts"][index])
 
-    unknowns = {"model": parameters, "starts": fitted[1][:, 0]}
+    def closest(unknowns: Any, *window: Array) -> Array:
+        from_start = functools.partial(error, unknowns, window)
+        _, _, q, p, *_ = window
+        return from_start(nearest(from_start, jnp.append(q[0], p[0])))
+
+    _, _, q, p, *_ = fitted
+    unknowns = {"model": parameters, "starts": jnp.concatenate([q[:, 0], p[:, 0]], axis=1)}
     return selected_by(held_out, residual, unknowns, (jnp.arange(len(windows.t)), *fitted), seed, error=closest)
 
 
-def arrays(windows: Windows, validation: Windows, weights: Weights) -> list[tuple[Array, ...]]:
-    """Returns the arrays of both sets that a fit reads, on the device.
-
-    Raises:
-        InputError: as for `phase_problem`.
-    """
-    require_windows(windows, validation, state_weight=weights.state, rate_weight=weights.rate)
-    if weights.rate is not None and (windows.rate is None or validation.rate is None):
-        raise InputError("the weights count rates, which the windows lack; leave their weight out")
-    keys = ("t", "state", "weight", *(["rate"] if weights.rate is not None else []))
-    return [arrays_of(part, keys, jnp.result_type(float)) for part in (windows, validation)]
-
-
-def require_windows(windows: Any, validation: Any, **deviations: tuple[float, ...] | float | None) -> None:
+def require_windows(
+    windows: MeasuredWindows, validation: MeasuredWindows, **deviations: tuple[float, ...] | float | None
+) -> None:
     """Raises `InputError` for a set without windows, or a standard deviation that is not positive."""
     for name, values in deviations.items():
         for deviation in np.ravel(values) if values is not None else ():
@@ -216,21 +211,6 @@ def _descend(residual: Callable[[Array], Array], start: Array, steps: int) -> tu
     return jax.lax.scan(step, (start, nothing), length=steps)[0]
 
 
-class MeasuredWindows(NamedTuple):
-    """W windows of equal length; shorter ones repeat their last sample with weight zero."""
-
-    t: np.ndarray
-    """Time since the window's first sample [W, T], in s."""
-    q: np.ndarray
-    """[W, T, d]."""
-    qd: np.ndarray
-    """[W, T, d], measured, or an estimate that only provides the initial start."""
-    tau: np.ndarray
-    """[W, T, d]."""
-    weight: np.ndarray
-    """1 for a sample, 0 for a repeated one [W, T]."""
-
-
 class Noise(NamedTuple):
     """Standard deviations of the measurements, one per coordinate or one for all."""
 
@@ -251,17 +231,6 @@ class Gauge(NamedTuple):
     """Mean of its diagonal there, kg m² or kg."""
 
 
-def cut_measured_windows(data: Trajectories, length: int) -> MeasuredWindows:
-    """Cuts consecutive windows of `length` samples within segments without a gap.
-
-    Raises:
-        InputError: a length below 2, or no two samples without a gap between them.
-    """
-    indices, weight = window_indices(data, length)
-    t = data.t[indices]
-    return MeasuredWindows(t - t[:, :1], data.q[indices], data.qd[indices], data.tau[indices], weight)
-
-
 def motion(
     system: Dynamics | PlainDynamics,
     start: Float[Array, " two_d"],
@@ -272,17 +241,15 @@ def motion(
     substeps: int = 1,
 ) -> Float[Array, "T two_d"]:
     """States (q, qd) at the times t from `start`, by RK4, with or without torques."""
-    d = start.shape[0] // 2
-    driving = jnp.zeros((t.shape[0], d), start.dtype) if tau is None else tau
+    first = tuple(jnp.split(start, 2))
+    driving = jnp.zeros((len(t), len(first[0])), start.dtype) if tau is None else tau
 
     def rate(state: tuple[Array, Array], tau: Array) -> tuple[Array, Array]:
         q, qd = state
         return qd, system.forward_dynamics(q, qd, tau)
 
-    slopes = torque_slopes(driving, t, torque)
-    state, drive = (start[:d], start[d:]), (driving[:-1], slopes, jnp.diff(t))
-    q, qd = driven(rate, state, *drive, substeps=substeps, method=looped_rk4)
-    return jnp.concatenate([q, qd], axis=1)
+    drive = driving[:-1], torque_slopes(driving, t, torque), jnp.diff(t)
+    return jnp.concatenate(driven(rate, first, *drive, substeps=substeps, method=looped_rk4), axis=1)
 
 
 def measured_problem(
@@ -318,27 +285,36 @@ def measured_problem(
     d = windows.q.shape[2]
     require_windows(windows, validation, noise_q=noise.q, noise_qd=noise.qd, noise_tau=noise.tau)
     check_gauge(gauge, windows.tau, d)
+    fitted, held_out = (arrays_of(part, ("t", "q", "qd", "tau", "weight")) for part in (windows, validation))
 
     def first(window: tuple[Array, ...]) -> Array:
         _, q, qd, *_ = window
         return jnp.concatenate([q[0], qd[0], *([] if noise.tau is None else [jnp.zeros(d)])])
 
-    def error(system: Dynamics | PlainDynamics, start: Array, window: tuple[Array, ...]) -> Array:
-        return _measured_residual(system, start, window, noise=noise, torque=torque, substeps=substeps)
+    def error(system: Dynamics | PlainDynamics, window: tuple[Array, ...], start: Array) -> Array:
+        t, q, qd, tau, weight = window
+        push = start[2 * d :]
+        states = motion(
+            system, start[: 2 * d], t, tau if noise.tau is None else tau + push, torque=torque, substeps=substeps
+        )
+        errors = [(states[:, :d] - q) / jnp.asarray(noise.q)]
+        if noise.qd is not None:
+            errors.append((states[:, d:] - qd) / jnp.asarray(noise.qd))
+        left = weigh(weight, *errors)
+        return left if noise.tau is None else jnp.concatenate([left, push / jnp.asarray(noise.tau)])
 
     def residual(parameters: Parameters, *window: Array) -> Array:
-        frozen = dynamics(model.energies(jax.lax.stop_gradient(parameters)))
-        system = dynamics(model.energies(parameters))
+        frozen, system = (dynamics(model.energies(part)) for part in (jax.lax.stop_gradient(parameters), parameters))
         left = without_start(
-            lambda start: error(frozen, start, window), lambda start: error(system, start, window), first(window)
+            functools.partial(error, frozen, window), functools.partial(error, system, window), first(window)
         )
         return jnp.append(left, gauge_error(system, gauge))
 
     def closest(parameters: Parameters, *window: Array) -> Array:
-        system = dynamics(model.energies(parameters))
-        return error(system, nearest(lambda start: error(system, start, window), first(window)), window)
+        from_start = functools.partial(error, dynamics(model.energies(parameters)), window)
+        return from_start(nearest(from_start, first(window)))
 
-    return selected_by(arrays_of(validation), residual, parameters, arrays_of(windows), seed, error=closest)
+    return selected_by(held_out, residual, parameters, fitted, seed, error=closest)
 
 
 def check_gauge(gauge: Gauge | None, tau: np.ndarray, d: int) -> None:
@@ -356,26 +332,5 @@ def gauge_error(system: Dynamics | PlainDynamics, gauge: Gauge | None) -> Float[
     """Distance of the mass matrix from the gauge, in units of `GAUGE_TOLERANCE` [1]; empty without either."""
     if gauge is None or not isinstance(system, Dynamics):
         return jnp.zeros(0)
-    M = system.mass_matrix(jnp.asarray(gauge.q))
-    return jnp.reshape(jnp.mean(jnp.diagonal(M)) / gauge.mass - 1, 1) / GAUGE_TOLERANCE
-
-
-def _measured_residual(
-    system: Dynamics | PlainDynamics,
-    start: Array,
-    window: tuple[Array, ...],
-    *,
-    noise: Noise,
-    torque: Torque,
-    substeps: int,
-) -> Array:
-    t, q, qd, tau, weight = window
-    d = q.shape[1]
-    start, push = start[: 2 * d], start[2 * d :]
-    pushed = tau if noise.tau is None else tau + push
-    states = motion(system, start, t, pushed, torque=torque, substeps=substeps)
-    errors = [(states[:, :d] - q) / jnp.asarray(noise.q)]
-    if noise.qd is not None:
-        errors.append((states[:, d:] - qd) / jnp.asarray(noise.qd))
-    residual = weigh(weight, *errors)
-    return residual if noise.tau is None else jnp.concatenate([residual, push / jnp.asarray(noise.tau)])
+    masses = jnp.diagonal(system.mass_matrix(jnp.asarray(gauge.q)))
+    return jnp.reshape(jnp.mean(masses) / gauge.mass - 1, 1) / GAUGE_TOLERANCE

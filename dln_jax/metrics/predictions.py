@@ -105,7 +105,7 @@ def padded(motions: list[MeasuredWindows]) -> MeasuredWindows:
     """Pads motions to windows of one length: shorter ones repeat their last sample, with weight 0."""
     longest = np.arange(max(len(motion.t) for motion in motions))
     alike = (jax.tree.map(lambda array: array[np.minimum(longest, len(array) - 1)], motion) for motion in motions)
-    windows = MeasuredWindows(*map(np.stack, zip(*alike, strict=True)))
+    windows = jax.tree.map(lambda *arrays: np.stack(arrays), *alike)
     return windows._replace(weight=windows.weight * [longest < len(motion.t) for motion in motions])
 
 
@@ -135,7 +135,7 @@ def predict_measured(
         raise InputError(f"fitted is {fitted}; expected 2 samples or more, and fewer than the {segments.t.shape[1]}")
     spread = segments.q.reshape(-1, segments.q.shape[2]).std(axis=0)
     scale = jnp.asarray(np.where(spread > 0, spread, 1.0))
-    measured = tuple(map(jnp.asarray, segments))
+    measured = tuple(map(jnp.asarray, segments[:5]))
     return Predictions(*map(np.asarray, _predict(model, parameters, measured, scale, fitted, substeps, momenta)))
 
 

@@ -30,6 +30,7 @@ along the joints gives all of them, since P, Q, v and dv/dt of a body are linear
 """
 
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -48,6 +49,8 @@ from dln_jax.types import InputError, JointKind, Needs, Scalar, Vector
 
 CHUNK = 24
 """Number of samples per chunk, small enough that C code for seven joints fits its stack."""
+PAIRS = 500
+"""Number of pairs of states per block, which fit into cache."""
 
 
 class KernelScales(NamedTuple):
@@ -81,26 +84,8 @@ class KernelParameters(NamedTuple):
     """Viscous friction of the coordinates [d], in N m s or N s/m."""
 
 
-class JointFactor(NamedTuple):
-    """c(x, y) and its derivatives, as arrays that broadcast."""
-
-    value: Array
-    by_x: Array
-    by_y: Array
-    by_both: Array
-
-
-class Shared(NamedTuple):
-    """Inner products [n] of a body's velocity with quantities of the samples."""
-
-    velocity: Array
-    """With the sample's velocity v."""
-    acceleration: Array
-    """With dv/dt."""
-    momentum: Array
-    """With sum_i w_i dv/dqd_i, w the sample's weights."""
-    force: Array
-    """With sum_i w_i (d/dt dv/dqd_i - dv/dq_i)."""
+Factor = tuple[Array, Array, Array, Array]
+"""A function of x and y, and its derivatives by x, by y and by both, as arrays that broadcast."""
 
 
 def make_trigonometric_kernel(
@@ -139,44 +124,42 @@ def make_trigonometric_kernel(
     return Model(init, lambda parameters: _system(parameters, needs.joints, serial))
 
 
-def turn_factor(joint: JointKind, pair: Array, x: Array, y: Array) -> JointFactor:
+def turn_factor(joint: JointKind, pair: Array, x: Array, y: Array) -> Factor:
     """Returns c of a joint."""
     a, b = pair
     if joint == "prismatic":
-        return JointFactor(a + b * x * y, b * y, b * x, b * jnp.ones_like(x * y))
+        return a + b * x * y, b * y, b * x, b * jnp.ones_like(x * y)
     cosine = b * (jnp.cos(x) * jnp.cos(y) + jnp.sin(x) * jnp.sin(y))
     sine = b * (jnp.sin(x) * jnp.cos(y) - jnp.cos(x) * jnp.sin(y))
-    return JointFactor(a + cosine, -sine, sine, cosine)
+    return a + cosine, -sine, sine, cosine
 
 
-def lift_factor(joint: JointKind, pair: Array, x: Array, y: Array) -> JointFactor:
+def lift_factor(joint: JointKind, pair: Array, x: Array, y: Array) -> Factor:
     """Returns h of a joint."""
-    c = turn_factor(joint, pair, x, y)
+    turn = c, by_x, by_y, by_both = turn_factor(joint, pair, x, y)
     if joint == "revolute":
-        return c
-    return JointFactor(
-        c.value**2, 2 * c.value * c.by_x, 2 * c.value * c.by_y, 2 * (c.by_x * c.by_y + c.value * c.by_both)
-    )
+        return turn
+    return c**2, 2 * c * by_x, 2 * c * by_y, 2 * (by_x * by_y + c * by_both)
 
 
 def _system(parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool) -> RecursiveSystem:
-    scales, friction = parameters.scales, parameters.friction
+    inertia, friction = parameters.scales.inertia, parameters.friction
 
     def kinetic(q: Vector, qd: Vector) -> Scalar:
         def of(some: KernelParameters) -> Scalar:
-            s = _shared(some, joints, serial, q, qd)
-            return 2 * jnp.sum(scales.inertia @ (s.momentum * s.acceleration + s.velocity * s.force))
+            velocity, acceleration, momentum, force = _products(some, joints, serial, q, qd)
+            return 2 * jnp.sum(inertia @ (momentum * acceleration + velocity * force))
 
         return _summed(of, parameters)
 
     def mass_matrix(q: Vector) -> Array:
+        product = functools.partial(jnp.einsum, "ikn,jkn->ij")
+
         def half(some: KernelParameters) -> Array:
-            s = jax.vmap(lambda qd: _shared(some, joints, serial, q, qd))(jnp.eye(len(joints), dtype=q.dtype))
-            weighted = scales.inertia[:, None] * s.acceleration, scales.inertia[:, None] * s.force
-            momentum, velocity = (
-                jnp.einsum("ikn,jkn->ij", *pair) for pair in zip((s.momentum, s.velocity), weighted, strict=True)
-            )
-            return momentum + velocity
+            products = jax.vmap(lambda qd: _products(some, joints, serial, q, qd))(jnp.eye(len(joints), dtype=q.dtype))
+            velocity, acceleration, momentum, force = products
+            weight = inertia[:, None]
+            return product(momentum, weight * acceleration) + product(velocity, weight * force)
 
         M = _summed(half, parameters)
         return 2 * (M + M.T)
@@ -194,50 +177,53 @@ def _system(parameters: KernelParameters, joints: tuple[JointKind, ...], serial:
     )
 
 
-def _shared(parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool, q: Vector, qd: Vector) -> Shared:
-    """Returns inner products for all K bodies with an inertia, as arrays [K, n]; linear in qd."""
-    scales = parameters.scales
+def _products(
+    parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool, q: Vector, qd: Vector
+) -> tuple[Array, ...]:
+    """Inner products [K, n] of the velocities of all K bodies with an inertia with quantities of the samples.
+
+    These are the sample's velocity v, dv/dt, sum_i w_i dv/dqd_i and sum_i w_i (d/dt dv/dqd_i - dv/dq_i), with w the
+    sample's weights. They are linear in qd.
+    """
     moved, accelerated, weights = (array.T for array in (parameters.qd, parameters.qdd, parameters.weights))
-    rates = (scales.rates * qd)[:, None]
-    entered = Shared(rates * moved, rates * accelerated, rates * weights, jnp.zeros_like(moved))
-    turns = [turn_factor(kind, scales.turns[k], q[k], parameters.q[:, k]) for k, kind in enumerate(joints)]
-    value = jnp.stack([turn.value for turn in turns])
-    slope = jnp.stack([jnp.broadcast_to(turn.by_y, turn.value.shape) for turn in turns])
+    rates = (parameters.scales.rates * qd)[:, None]
+    entering = rates * moved, rates * accelerated, rates * weights, jnp.zeros_like(moved)
+    turns = [turn_factor(kind, parameters.scales.turns[k], q[k], parameters.q[:, k]) for k, kind in enumerate(joints)]
+    value = jnp.stack([c for c, *_ in turns])
+    slope = jnp.stack([jnp.broadcast_to(by_y, c.shape) for c, _, by_y, _ in turns])
 
-    def turned(s: Shared, c: Array, by_y: Array, moved: Array, weight: Array) -> Shared:
-        return Shared(
-            c * s.velocity,
-            c * s.acceleration + by_y * moved * s.velocity,
-            c * s.momentum,
-            c * s.force + by_y * (moved * s.momentum - weight * s.velocity),
+    def link(before: tuple[Array, ...], at: tuple) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        velocity, acceleration, momentum, force = before
+        new, c, by_y, moved, weight = at
+        after = (
+            c * velocity,
+            c * acceleration + by_y * moved * velocity,
+            c * momentum,
+            c * force + by_y * (moved * momentum - weight * velocity),
         )
-
-    def link(s: Shared, at: tuple) -> tuple[Shared, Shared]:
-        new, *rest = at
-        s = turned(s, *rest)
         if serial:
-            s = Shared(*(product + more for product, more in zip(s, new, strict=True)))
-        return s, s
+            after = jax.tree.map(jnp.add, after, new)
+        return after, after
 
-    start = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]) if serial else jnp.sum(leaf, axis=0), entered)
-    last, bodies = lax.scan(link, start, (entered, value, slope, moved, weights))
-    return bodies if serial else Shared(*(product[None] for product in last))
+    start = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]) if serial else jnp.sum(leaf, axis=0), entering)
+    last, bodies = lax.scan(link, start, (entering, value, slope, moved, weights))
+    return bodies if serial else jax.tree.map(lambda product: product[None], last)
 
 
 def _potential(
     parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool
 ) -> Callable[[Vector], Scalar] | None:
     weight, lifts = parameters.scales.weight, parameters.scales.lifts
-    if weight is None or lifts is None:
+    if weight is None:
         return None
 
     def of(some: KernelParameters, q: Vector) -> Scalar:
         height, force = jnp.ones_like(some.q[:, 0]), jnp.zeros_like(some.q[:, 0])
         bodies = []
         for joint, kind in enumerate(joints):
-            h = lift_factor(kind, lifts[joint], q[joint], some.q[:, joint])
-            force = h.value * force + h.by_y * some.weights[:, joint] * height
-            height = h.value * height
+            h, _, by_y, _ = lift_factor(kind, lifts[joint], q[joint], some.q[:, joint])
+            force = h * force + by_y * some.weights[:, joint] * height
+            height = h * height
             bodies.append(jnp.sum(force))
         return jnp.stack(bodies if serial else bodies[-1:]) @ weight
 
@@ -246,15 +232,15 @@ def _potential(
 
 def _summed(function: Callable[[KernelParameters], Array], parameters: KernelParameters) -> Array:
     """Sums over chunks of samples, small enough that a batch of states and its derivatives fit into memory."""
-    samples = (parameters.q, parameters.qd, parameters.qdd, parameters.weights)
+    *samples, scales, friction = parameters
     n, d = parameters.q.shape
     if n <= CHUNK:
         return function(parameters)
     # The padding of the last chunk has weight zero.
     pieces = [jnp.pad(array, ((0, -n % CHUNK), (0, 0))).reshape(-1, CHUNK, d) for array in samples]
 
-    def of(q: Array, qd: Array, qdd: Array, weights: Array) -> Array:
-        return function(parameters._replace(q=q, qd=qd, qdd=qdd, weights=weights))
+    def of(*some: Array) -> Array:
+        return function(KernelParameters(*some, scales=scales, friction=friction))
 
     @jax.checkpoint
     def add(total: Array, piece: list[Array]) -> tuple[Array, None]:
@@ -265,29 +251,8 @@ def _summed(function: Callable[[KernelParameters], Array], parameters: KernelPar
     return total
 
 
-PAIRS = 500
-"""Number of pairs of states per block, which fit into cache."""
-
-
-class States(NamedTuple):
-    """States as arrays [N, d], or with axes of pairs after the axis of joints."""
-
-    q: Any
-    qd: Any
-    qdd: Any
-
-
-class Products(NamedTuple):
-    """Inner products of (P_1 .. P_d, v) and (Q_1 .. Q_d, dv/dt), as arrays [d + 1, d + 1, R, M]; primes are second."""
-
-    first: Array
-    """<P, P'>."""
-    mixed: Array
-    """<P, Q'>."""
-    mirrored: Array
-    """<Q, P'>."""
-    second: Array
-    """<Q, Q'>."""
+States = tuple[Any, Any, Any]
+"""q, qd and qdd as arrays [N, d], or with axes of pairs after the axis of joints."""
 
 
 def torque_covariance(
@@ -298,12 +263,12 @@ def torque_covariance(
     Every state is paired with the N/2 that follow it, cyclically; the other pairs are transposes of these. Blocks of
     rows are computed in turn; derivatives recompute them, because their intermediate values exceed the caches.
     """
-    N, d = np.shape(states.q)
-    states, width = States(*map(jnp.asarray, states)), N // 2 + 1
+    N, d = np.shape(states[0])
+    arrays, width = [jnp.asarray(array) for array in states], N // 2 + 1
     following = jnp.asarray((np.arange(N)[:, None] + np.arange(width)) % N)
 
     def block(rows: Array) -> Array:
-        x, y = (States(*(jnp.moveaxis(array[at], 2, 0) for array in states)) for at in (rows[:, None], following[rows]))
+        x, y = ([jnp.moveaxis(array[at], 2, 0) for array in arrays] for at in (rows[:, None], following[rows]))
         return _block(joints, serial, scales, x, y)
 
     rows = max(1, min(N, PAIRS // width))
@@ -319,26 +284,29 @@ def torque_covariance(
 
 
 def _block(
-    joints: tuple[JointKind, ...], serial: bool, scales: KernelScales, x: States, y: States
+    joints: tuple[JointKind, ...], serial: bool, scales: KernelScales, x: list[Array], y: list[Array]
 ) -> Float[Array, "d d R K"]:
-    """Returns the covariance of states x [d, R, 1] with y [d, R, K]; pairs are the last axes, for long inner loops."""
-    d = len(joints)
-    pairs = jnp.zeros(np.broadcast_shapes(x.q.shape[1:], y.q.shape[1:]), x.q.dtype)
-    turns = _factors(turn_factor, joints, scales.turns, x.q, y.q)
-    has_potential = scales.weight is not None and scales.lifts is not None
-    lifts = _factors(lift_factor, joints, scales.lifts, x.q, y.q) if has_potential else None
-    unit = jnp.eye(d + 1, dtype=pairs.dtype)[:d]
-    # Without a known order only the last body has an energy, and all rates enter before the first joint.
-    of_body = (lambda scale: scale) if serial else (lambda scale: jnp.zeros(d, scale.dtype).at[-1].set(scale[0]))
+    """Returns the covariance of states x [d, R, 1] with y [d, R, K]; pairs are the last axes, for long inner loops.
 
-    def entered(products: Products, joint: Any, rate: Array) -> Products:
-        at, (_, u, a), (_, w, b) = joint
-        e, last = at[:, None, None], jnp.zeros(d + 1, at.dtype).at[-1].set(1.0)[:, None, None]
-        P, P_other, Q, Q_other = e + last * u, e + last * w, last * a, last * b
-        pairs = ((P, P_other), (P, Q_other), (Q, P_other), (Q, Q_other))
-        return Products(
-            *(X + rate * left[:, None] * right[None] for X, (left, right) in zip(products, pairs, strict=True))
-        )
+    It carries inner products of P = (P_1 .. P_d, v) and Q = (Q_1 .. Q_d, dv/dt) as four arrays [d + 1, d + 1, R, K]:
+    <P, P'>, <P, Q'>, <Q, P'> and <Q, Q'>, where primes are those of y.
+    """
+    d, dtype = len(joints), x[0].dtype
+    nothing = jnp.zeros((d + 1, d + 1, *np.broadcast_shapes(x[0].shape[1:], y[0].shape[1:])), dtype)
+    turns = _factors(turn_factor, joints, scales.turns, x[0], y[0])
+    # Without a known order only the last body has an energy, and all rates enter before the first joint.
+    inertia = jnp.pad(scales.inertia, (d - len(scales.inertia), 0))
+    heights = lifts = weight = None
+    if scales.weight is not None:
+        weight = jnp.pad(scales.weight, (d - len(scales.weight), 0))
+        lifts = _factors(lift_factor, joints, scales.lifts, x[0], y[0])
+        heights = nothing.at[d, d].set(1.0)
+    last = jnp.zeros((d + 1, 1, 1), dtype).at[-1].set(1.0)
+
+    def entered(products: tuple[Array, ...], joint: Any, rate: Array) -> tuple[Array, ...]:
+        e, (_, u, a), (_, w, b) = joint
+        pairs = itertools.product((e + last * u, last * a), (e + last * w, last * b))
+        return tuple(X + rate * left[:, None] * right[None] for X, (left, right) in zip(products, pairs, strict=True))
 
     def link(carry: tuple, at: tuple) -> tuple[tuple, None]:
         products, heights, total = carry
@@ -352,30 +320,28 @@ def _block(
             total = total + weight * heights[:d, :d]
         return (products, heights, total), None
 
-    nothing = jnp.zeros((d + 1, d + 1, *pairs.shape), pairs.dtype)
-    products = Products(nothing, nothing, nothing, nothing)
-    joint_axes = (unit, x, y)
+    products = (nothing,) * 4
+    joint_axes = (jnp.eye(d + 1, dtype=dtype)[:d, :, None, None], x, y)
     if not serial:
         for joint in range(d):
             one = jax.tree.map(lambda leaf, joint=joint: leaf[joint], joint_axes)
             products = entered(products, one, scales.rates[joint])
-    heights = nothing.at[d, d].set(1.0) if has_potential else None
-    weight = of_body(scales.weight) if has_potential else None
-    links = (joint_axes, scales.rates, turns, of_body(scales.inertia), lifts, weight)
+    links = (joint_axes, scales.rates, turns, inertia, lifts, weight)
     (_, _, total), _ = lax.scan(jax.checkpoint(link), (products, heights, nothing[:d, :d]), links)
     return total
 
 
-def _factors(factor: Any, joints: tuple[JointKind, ...], pairs: Any, x: Array, y: Array) -> Any:
+def _factors(
+    factor: Callable[..., Factor], joints: tuple[JointKind, ...], pairs: Any, x: Array, y: Array
+) -> tuple[Array, ...]:
     factors = [factor(kind, pairs[joint], x[joint], y[joint]) for joint, kind in enumerate(joints)]
     # Derivatives for a prismatic joint do not vary along both axes.
     return jax.tree.map(lambda *leaves: jnp.stack(jnp.broadcast_arrays(*leaves, x[0] + y[0])[:-1]), *factors)
 
 
-def _turned(products: Products, c: Any, joint: Any) -> Products:
+def _turned(products: tuple[Array, ...], turn: Factor, joint: Any) -> tuple[Array, ...]:
     """Passes a joint: v becomes C v, like P; Q becomes C Q + dC/dq (qd P - e vᵀ), with e the joint's unit vector."""
-    at, (_, u, _), (_, w, _) = joint
-    e = at[:, None, None]
+    e, (_, u, _), (_, w, _) = joint
 
     def rows(X: Array) -> Array:
         return u * X - e[:, None] * X[-1]
@@ -383,46 +349,31 @@ def _turned(products: Products, c: Any, joint: Any) -> Products:
     def columns(X: Array) -> Array:
         return w * X - X[:, -1, None] * e
 
-    first, mixed, mirrored, second = products
-    turned = columns(first)
-    return Products(
-        c.value * first,
-        c.value * mixed + c.by_y * turned,
-        c.value * mirrored + c.by_x * rows(first),
-        c.value * second + c.by_x * rows(mixed) + c.by_y * columns(mirrored) + c.by_both * rows(turned),
+    c, by_x, by_y, by_both = turn
+    PP, PQ, QP, QQ = products
+    turned = columns(PP)
+    return (
+        c * PP,
+        c * PQ + by_y * turned,
+        c * QP + by_x * rows(PP),
+        c * QQ + by_x * rows(PQ) + by_y * columns(QP) + by_both * rows(turned),
     )
 
 
-def _kinetic(products: Products) -> Array:
-    """Returns cov(tau_i, tau_j') of one body with unit inertia, [d, d, R, M]."""
-    PP, PQ, QP, QQ = products
-    inner, column, row, corner = _parts(PP), _parts(PQ), _parts(QP), _parts(QQ)
+def _kinetic(products: tuple[Array, ...]) -> Array:
+    """Returns cov(tau_i, tau_j') of one body with unit inertia, [d, d, R, K]."""
     # Every product of blocks has a counterpart with v and dv/dt exchanged.
-    return 2 * (
-        inner.block * corner.end + column.right * row.below
-        + column.block * row.end + inner.right * corner.below
-        + row.block * column.end + corner.right * inner.below
-        + corner.block * inner.end + row.right * column.below
-    )  # fmt: skip
+    exchanged = zip(products, reversed(products), strict=True)
+    terms = (X[:-1, :-1] * Y[-1, -1] + X[:-1, -1:] * Y[-1:, :-1] for X, Y in exchanged)
+    return 2 * functools.reduce(jnp.add, terms)
 
 
-class _Parts(NamedTuple):
-    block: Array
-    right: Array
-    below: Array
-    end: Array
-
-
-def _parts(X: Array) -> _Parts:
-    return _Parts(X[:-1, :-1], X[:-1, -1:], X[-1:, :-1], X[-1, -1])
-
-
-def _lifted(heights: Array, h: Any, at: Array) -> Array:
+def _lifted(heights: Array, lift: Factor, e: Array) -> Array:
     """Returns inner products of (dz/dq_1 .. dz/dq_d, z); z is the product of functions of the joints so far."""
-    e = at[:, None, None]
+    h, by_x, by_y, by_both = lift
     return (
-        h.value * heights
-        + h.by_x * e[:, None] * heights[-1]
-        + h.by_y * heights[:, -1, None] * e
-        + h.by_both * e[:, None] * e * heights[-1, -1]
+        h * heights
+        + by_x * e[:, None] * heights[-1]
+        + by_y * heights[:, -1, None] * e
+        + by_both * e[:, None] * e * heights[-1, -1]
     )

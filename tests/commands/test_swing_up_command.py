@@ -15,7 +15,7 @@ from dln_jax.control.plants.runs import PlantRun, Trials
 from dln_jax.control.plants.tuning import Tuned
 from dln_jax.control.regulators import Regulator
 from dln_jax.data import schema
-from dln_jax.learning.weak_forms import FittedPlant
+from dln_jax.learning.recordings import FittedPlant
 
 MOTOR = "--actuated elbow --control 5"
 

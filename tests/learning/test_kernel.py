@@ -7,9 +7,8 @@ from calls import one_line
 from jax.flatten_util import ravel_pytree
 
 from dln_jax.data.splits import select
-from dln_jax.learning.kernel import TorqueEquations, Unknowns, fit_kernel, likelihood, start_of
+from dln_jax.learning.kernel import fit_kernel, likelihood, start_of
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.models.kernel import States
 from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.pendulums import pendulum, two_link_arm
 from dln_jax.zoo.descriptions import make
@@ -46,9 +45,9 @@ def test_torques_and_friction_are_found_where_the_basis_is_exact(arm):
 def test_slope_of_the_likelihood_is_that_of_its_differences():
     scene = pendulum(friction=0.2)
     data = uniform(scene, samples=20, rate_bound=3.0, acceleration_bound=5.0)
-    equations = TorqueEquations(States(data.q, data.qd, data.qdd), np.zeros((20, 0)), data.tau)
+    equations = (data.q, data.qd, data.qdd), np.zeros((20, 0)), data.tau
     unit = data.tau.std(axis=0)
-    start = Unknowns(start_of(scene.needs, False, equations, unit), np.log(0.1 * unit))
+    start = start_of(scene.needs, False, equations, unit), np.log(0.1 * unit)
     flat, unravel = ravel_pytree(start)
     evaluate = jax.jit(likelihood(scene.needs.joints, False))
     slope = ravel_pytree(evaluate(start, equations)[1])[0]

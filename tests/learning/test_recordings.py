@@ -8,14 +8,8 @@ from calls import one_line
 from dln_jax.control.desktop_plants import desktop_plant, model_of_plant, simulated_plant
 from dln_jax.control.plants.exploring import Exploration, explore
 from dln_jax.data.schema import from_arrays
-from dln_jax.learning.weak_forms import (
-    cut_momentum_windows,
-    deviations,
-    driven_torques,
-    identified,
-    identified_chain,
-    prepare,
-)
+from dln_jax.learning.momentum import cut_momentum_windows, window_errors
+from dln_jax.learning.recordings import driven_torques, identified, identified_chain, prepare
 
 PLANT = desktop_plant("rotary-pendulum")
 TRUTH = model_of_plant(PLANT)
@@ -42,8 +36,8 @@ def prepared(recording):
 def test_the_delay_is_found_and_the_truth_leaves_noise_alone(prepared):
     assert prepared.delay == PLANT.hardware.delay
     assert len(np.unique(prepared.train.trajectory)) == 5 and len(np.unique(prepared.validation.trajectory)) == 1
-    left = deviations(TRUTH, cut_momentum_windows(prepared.train))
-    assert (left < 0.02 * prepared.train.tau[:, 0].std()).all()
+    left = np.asarray(window_errors(TRUTH, cut_momentum_windows(prepared.train)))
+    assert (np.sqrt(np.mean(left**2, axis=0)) < 0.02 * prepared.train.tau[:, 0].std()).all()
 
 
 @pytest.mark.slow

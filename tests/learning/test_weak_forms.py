@@ -8,7 +8,7 @@ import pytest
 from calls import one_line
 from planar_arm import ARM, motions
 
-from dln_jax.learning.weak_forms import fit_momentum, momentum_and_rest, window_weights
+from dln_jax.learning.momentum import fit_momentum, momentum_and_rest, window_weights
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.trees import make_rigid_tree
 from dln_jax.scenes.pendulums import two_link_arm

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.models.kernel import States, make_trigonometric_kernel, torque_covariance
+from dln_jax.models.kernel import make_trigonometric_kernel, torque_covariance
 from dln_jax.types import Needs
 
 
@@ -18,13 +18,13 @@ def test_covariance_is_that_of_the_energies(serial):
     parameters = model.init(jax.random.key(1))
     random = np.random.default_rng(0)
     scales = jax.tree.map(lambda leaf: jnp.asarray(random.uniform(0.5, 2, leaf.shape)), parameters.scales)
-    parameters, states = parameters._replace(scales=scales), States(*random.normal(size=(3, 2, 2)))
-    every = States(*map(np.concatenate, zip(states, parameters[:3], strict=True)))  # with the samples of the model
+    parameters, states = parameters._replace(scales=scales), tuple(random.normal(size=(3, 2, 2)))
+    every = tuple(map(np.concatenate, zip(states, parameters[:3], strict=True)))  # with the samples of the model
     whole = np.asarray(torque_covariance(joints, serial, parameters.scales, every))
     np.testing.assert_allclose(whole, whole.T, rtol=0, atol=1e-12 * abs(whole).max())
     sizes = np.linalg.eigvalsh(whole)
     assert sizes.min() > -1e-12 * sizes.max()
-    predicted = whole[: states.q.size, states.q.size :] @ np.ravel(parameters.weights)
+    predicted = whole[: states[0].size, states[0].size :] @ np.ravel(parameters.weights)
     tau = jax.jit(jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics))(*states)
     np.testing.assert_allclose(tau.ravel(), predicted, rtol=0, atol=1e-12 * float(abs(predicted).max()))
 

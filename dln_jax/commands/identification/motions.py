@@ -9,6 +9,7 @@ the others. The parameters fitted to torques are a candidate too, and are kept i
 
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -18,7 +19,6 @@ from dln_jax.data.splits import in_blocks, select
 from dln_jax.identification import equations
 from dln_jax.identification.identify import Identification, identify, parameters_of
 from dln_jax.identification.motions import REWEIGHTINGS, MotionFit, cut_motions, fit_motions
-from dln_jax.learning.shooting import MeasuredWindows
 from dln_jax.metrics.predictions import cut_segments, predict_measured, valid_times
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError
@@ -164,7 +164,7 @@ def prediction_times(
     segments = cut_segments(held, samples, every=max(1, min(round(EVERY / step), samples // 2)))
     count = len(segments.t)
     rows = np.minimum(np.arange(-(-count // TOGETHER) * TOGETHER), count - 1)  # few shapes, so few programs
-    padded = MeasuredWindows(*(array[rows] for array in segments))
+    padded = jax.tree.map(lambda array: array[rows], segments)
     predicted = predict_measured(model, parameters, padded, fitted=fitted)
     return valid_times(padded, predicted, fitted=fitted, variance=variance)[:count], (samples - fitted) * step
 

@@ -20,10 +20,9 @@ from dln_jax.learning.engine.problem import Problem, Progress, Training, losses,
 from dln_jax.learning.matching import accelerations_problem, match_linear, rates_problem
 from dln_jax.learning.shooting import (
     Gauge,
+    MeasuredWindows,
     Weights,
-    Windows,
     cut_measured_windows,
-    cut_windows,
     measured_problem,
     phase_problem,
 )
@@ -107,11 +106,10 @@ def problem_of_rates(log: PhaseLog, description: Description, parts: Halves, see
 def problem_of_motions(log: PhaseLog, description: Description, parts: Halves, start: Any, seed: int) -> Problem:
     """The fit of motions, starting from parameters of the first fit."""
     task, model, weights, substeps = log.task, build(description), log.weights, log.task.substeps
+    windows = [cut_measured_windows(part, task.window) for part in parts]
     if log.noise is not None and in_velocities(log, description):
-        measured = [cut_measured_windows(part, task.window) for part in parts]
         known = {"noise": log.noise, "gauge": gauge_of(log), "substeps": substeps, "seed": seed}
-        return measured_problem(model, start, *measured, **known)
-    windows = [cut_windows(part, task.window) for part in parts]
+        return measured_problem(model, start, *windows, **known)
     if weights is None:
         weights = task.weights or deviations(parts[0])
     else:
@@ -119,13 +117,14 @@ def problem_of_motions(log: PhaseLog, description: Description, parts: Halves, s
     return phase_problem(model, start, *windows, weights=weights, substeps=substeps, seed=seed)
 
 
-def substeps_of(windows: Windows, weights: Weights) -> int:
+def substeps_of(windows: MeasuredWindows, weights: Weights) -> int:
     """RK4 steps between samples that keep the error over a window well below the noise, at most `MOST_SUBSTEPS`.
 
     For an oscillation of angular frequency w, a step h has an error of (w h)⁵ / 120 times the amplitude.
     """
-    size = windows.state.reshape(-1, windows.state.shape[2]).std(axis=0)
-    change = np.diff(windows.state, axis=1)[windows.weight[:, 1:] > 0]
+    states = np.concatenate([windows.q, np.asarray(windows.p)], axis=2)
+    size = states.reshape(-1, states.shape[2]).std(axis=0)
+    change = np.diff(states, axis=1)[windows.weight[:, 1:] > 0]
     angle = np.max(np.sqrt(np.mean(change**2, axis=0)) / np.where(size > 0, size, np.inf))
     allowed = INTEGRATION_SHARE * np.min(np.asarray(weights.state) / np.where(size > 0, size, 1.0), initial=1.0)
     steps = np.arange(1, MOST_SUBSTEPS + 1)

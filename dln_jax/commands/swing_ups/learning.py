@@ -21,14 +21,7 @@ from dln_jax.control.state_space import field_of
 from dln_jax.data.encoders.sampling import held_at_equal_steps, noise_of
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.engine.problem import ProgressReport, silent
-from dln_jax.learning.weak_forms import (
-    FittedPlant,
-    PreparedRecording,
-    identified,
-    identified_chain,
-    learned,
-    prepare,
-)
+from dln_jax.learning.recordings import FittedPlant, PreparedRecording, identified, identified_chain, learned, prepare
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import InputError
 

@@ -49,7 +49,7 @@ from dln_jax.figures.closed_loops import (
     write_closed_loop_gif,
 )
 from dln_jax.files import write_figure, write_json
-from dln_jax.learning.weak_forms import STEPS
+from dln_jax.learning.recordings import STEPS
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.metrics.verdict import Verdict
 from dln_jax.runs.arguments import names_listed

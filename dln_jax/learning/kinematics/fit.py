@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import drawn
-from dln_jax.learning.kinematics.agreement import Twin, difference
 from dln_jax.learning.kinematics.frames import Frames
 from dln_jax.learning.kinematics.projection import (
     Descent,
@@ -24,7 +23,7 @@ from dln_jax.learning.kinematics.projection import (
     design,
     inertias_of,
 )
-from dln_jax.learning.kinematics.search import ALIKE, Search, count_agreeing, search
+from dln_jax.learning.kinematics.search import ALIKE, Search, Twin, count_agreeing, difference, search
 from dln_jax.learning.linear import design_chunks
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.models.trees import SerialTreeParameters, make_serial_tree
@@ -120,7 +119,8 @@ def fit_tree(
     with jax.enable_x64(True):
         scale = np.asarray(torque_scale(train))
         program, columns = compiled(structure, ridge=ridge), _columns(structure)
-        some, every = (_some(train, count, settings.seed) for count in (settings.samples, most_samples))
+        parts = [drawn(train, count, settings.seed) for count in (settings.samples, most_samples)]
+        some, every = ((part.q, part.qd, part.qdd, part.tau) for part in parts)
         searched, twin, until, wanted = ([], 0), None, began + settings.seconds, settings
 
         def finished(descent: Descent) -> tuple[Descent, least_squares.LeastSquaresSolution, np.ndarray, np.ndarray]:
@@ -171,12 +171,6 @@ def fit_tree(
         twin=twin,
         seconds=time.perf_counter() - began,
     )
-
-
-def _some(data: Trajectories, most: int, seed: int) -> Samples:
-    """q, qd, qdd and tau [N, d] of all samples, or of a random subset of at most `most`."""
-    some = drawn(data, most, seed)
-    return some.q, some.qd, some.qdd, some.tau
 
 
 def _alike(one: Descent, other: Descent) -> bool:

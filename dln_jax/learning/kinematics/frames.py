@@ -87,12 +87,11 @@ def turn_round(frames: Frames, parents: Sequence[int], joint: int) -> Frames:
 
     Where gravity dominates, torques hardly distinguish the two arms, and descents end at either.
     """
-    half = np.diag([1.0, -1.0, -1.0])
+    half, carried = np.diag([1.0, -1.0, -1.0]), np.equal(parents, joint)
     rotations, positions = map(np.array, frames)
     rotations[joint] = rotations[joint] @ half
-    for link, parent in enumerate(parents):
-        if parent == joint:
-            rotations[link], positions[link] = half @ rotations[link], half @ positions[link]
+    rotations[carried] = half @ rotations[carried]
+    positions[carried] = positions[carried] @ half
     return Frames(rotations, positions)
 
 
@@ -102,13 +101,11 @@ def mirror_image(frames: Frames, parents: Sequence[int], joints: Sequence[JointK
     Reflecting x in every frame reverses the rotation of revolute joints; reversing y and z of their links restores it.
     """
     mirror, half = np.diag([-1.0, 1.0, 1.0]), np.diag([1.0, -1.0, -1.0])
-    own = [half if kind == "revolute" else np.eye(3) for kind in joints]
-    before = [np.eye(3) if parent < 0 else own[parent] for parent in parents]
-    rotations = [
-        turn @ mirror @ R @ mirror @ after for turn, R, after in zip(before, frames.rotations, own, strict=True)
-    ]
-    positions = [turn @ mirror @ p for turn, p in zip(before, frames.positions, strict=True)]
-    return Frames(np.array(rotations), np.array(positions))
+    # The ground comes last, where the index -1 points.
+    own = np.array([*(half if kind == "revolute" else np.eye(3) for kind in joints), np.eye(3)])
+    turned = own[list(parents)] @ mirror
+    positions = np.einsum("iab,ib->ia", turned, np.asarray(frames.positions))
+    return Frames(turned @ np.asarray(frames.rotations) @ mirror @ own[:-1], positions)
 
 
 def frames_of_axes(
@@ -129,14 +126,12 @@ def frames_of_axes(
     lengths = np.linalg.norm(axes, axis=1)
     if not (lengths > 0).all():
         raise InputError(f"joint {int(np.argmin(lengths)) + 1} has an axis of length zero; expected a direction")
-    order = tuple(range(-1, d - 1)) if parents is None else tuple(parents)
-    turned = [_with_z_along(axis) for axis in axes / lengths[:, None]]
-    rotations, positions = [], []
-    for link, parent in enumerate(order):
-        R, p = (np.eye(3), np.zeros(3)) if parent < 0 else (turned[parent], points[parent])
-        rotations.append(R.T @ turned[link])
-        positions.append(R.T @ (points[link] - p))
-    return Frames(np.array(rotations), np.array(positions))
+    order = list(range(-1, d - 1) if parents is None else parents)
+    # The ground comes last, where the index -1 points.
+    turned = np.array([*map(_with_z_along, axes / lengths[:, None]), np.eye(3)])
+    into = turned[order].transpose(0, 2, 1)
+    apart = points - np.append(points, np.zeros((1, 3)), axis=0)[order]
+    return Frames(into @ turned[:-1], np.einsum("iab,ib->ia", into, apart))
 
 
 def kinematic_prior_from_json(values: Any, d: int, parents: Sequence[int] | None = None) -> KinematicPrior:

@@ -54,10 +54,9 @@ class Structure(NamedTuple):
     velocity_scale: float
     """Velocity scale of dry friction, 1/s or m/s."""
 
-    @property
-    def gravity(self) -> tuple[float, float, float]:
-        """Gravity, m/s², z up."""
-        return (0.0, 0.0, -self.acceleration)
+    def skeleton(self, frames: Frames) -> Skeleton:
+        """The tree with these frames; gravity points against z."""
+        return Skeleton(self.parents, self.joints, (0.0, 0.0, -self.acceleration), *frames)
 
     @property
     def inertial(self) -> np.ndarray:
@@ -93,8 +92,7 @@ class Projection(NamedTuple):
 def design(structure: Structure, frames: Frames, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d P"]:
     """Phi of one state, unscaled."""
     d = q.shape[0]
-    skeleton = Skeleton(structure.parents, structure.joints, structure.gravity, *frames)
-    regressor = scanned_regressor(skeleton, q, qd, qdd)
+    regressor = scanned_regressor(structure.skeleton(frames), q, qd, qdd)
     columns = [regressor.reshape(d, 10 * d)[:, structure.inertial], jnp.diag(qdd)]
     if structure.friction:
         columns += [jnp.diag(qd), jnp.diag(jnp.tanh(qd / structure.velocity_scale)), jnp.eye(d, dtype=q.dtype)]
@@ -134,8 +132,7 @@ def project(
     inertias = inertias_of(structure, linear)
 
     def force(step: Array, *state: Vector) -> Vector:
-        skeleton = Skeleton(structure.parents, structure.joints, structure.gravity, *displace(frames, step))
-        return scanned_forces(skeleton, inertias, *state) / unit
+        return scanned_forces(structure.skeleton(displace(frames, step)), inertias, *state) / unit
 
     still = jnp.zeros((tau.shape[1], 6), tau.dtype)
     places = free_directions(structure.parents, structure.joints)
@@ -191,19 +188,6 @@ def compiled(structure: Structure, *, ridge: float) -> Program:
     return jax.jit(iterate, compiler_options=quick_compilation())
 
 
-def unseen(frames: Frames, linear: int, directions: int) -> Descent:
-    """Returns an initial state; the first iteration only evaluates the frames, without a step."""
-    d = len(frames.positions)
-    at = Projection(
-        loss=jnp.asarray(jnp.inf),
-        squares=jnp.zeros(d),
-        linear=jnp.zeros(linear),
-        normal=jnp.eye(directions),
-        slope=jnp.zeros(directions),
-    )
-    return Descent(jax.tree.map(jnp.asarray, frames), at, jnp.asarray(FIRST_DAMPING / FEWER))
-
-
 def descend(
     program: Program,
     structure: Structure,
@@ -217,7 +201,15 @@ def descend(
     """Iterates until the loss settles, no step descends, or the iterations or the time are used up."""
     samples, unit = jax.tree.map(jnp.asarray, samples), jnp.asarray(unit)
     directions = len(free_directions(structure.parents, structure.joints))
-    state = unseen(frames, structure.linear_count, directions)
+    # The first iteration only evaluates the frames: without a slope there is no step.
+    at = Projection(
+        loss=jnp.asarray(jnp.inf),
+        squares=jnp.zeros(len(structure.joints)),
+        linear=jnp.zeros(structure.linear_count),
+        normal=jnp.eye(directions),
+        slope=jnp.zeros(directions),
+    )
+    state = Descent(jax.tree.map(jnp.asarray, frames), at, jnp.asarray(FIRST_DAMPING / FEWER))
     before = np.inf
     for _ in range(0, iterations, CHUNK):
         state = program(state, samples, unit)

@@ -1,27 +1,46 @@
 """Searches joint frames by many descents from random starts, and by discrete moves of the best, in parallel threads.
 
 Descents end in a few recurring local minima. If several starts agree on the lowest, it is probably the global minimum.
+
+Two fitted trees are the same arm if their joint axes at q = 0 are the same, up to what torques cannot determine. The
+axes of one are moved onto those of the other by a rotation and a shift, with or without a mirror. A point may slide
+along its axis, axes of prismatic joints have directions only, and gravity, if any, is one more direction.
 """
 
 import functools
 import itertools
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
-from dln_jax.learning.kinematics.frames import Frames, KinematicPrior, random_frames, rough_frames, turn_round
-from dln_jax.learning.kinematics.projection import Descent, Program, Samples, Structure, descend
+from dln_jax.learning.kinematics.frames import (
+    Frames,
+    KinematicPrior,
+    mirror_image,
+    random_frames,
+    rough_frames,
+    turn_round,
+)
+from dln_jax.learning.kinematics.projection import LENGTH, Descent, Program, Samples, Structure, descend
 from dln_jax.types import require_positive, require_seed
 
 WAVE = 8
 """Starts between two tests of agreement. It does not depend on the number of threads, so neither do the results."""
 ALIKE = 0.02
 """Largest relative difference of two losses that count as the same local minimum."""
+SAME_ANGLE, SAME_LENGTH = np.radians(5.0), 0.03
+"""Largest angle and distance between the axes of two arms that count as the same, rad and m."""
+SAME_ERROR = 0.1
+"""Largest relative difference of the validation errors of two descents that agree."""
+TURNS = 8
+"""Initial angles of the comparison about an axis, for arms whose axes are parallel."""
 
 
 class Search(NamedTuple):
@@ -117,3 +136,89 @@ def _turns(structure: Structure, frames: Frames, joints: int) -> Iterable[Frames
 
 def _sorted(descents: list[Descent]) -> list[Descent]:
     return sorted(descents, key=lambda descent: float(np.nan_to_num(descent.at.loss, nan=np.inf)))
+
+
+class Difference(NamedTuple):
+    """Largest differences between two arms."""
+
+    angle: float
+    """Between axes, or an axis and gravity, rad."""
+    length: float
+    """Between axes, across them, m."""
+
+    @property
+    def size(self) -> float:
+        """Sum of both, in units of the limits."""
+        return self.angle / SAME_ANGLE + self.length / SAME_LENGTH
+
+    @property
+    def same(self) -> bool:
+        """Whether they count as one arm."""
+        return bool(self.angle <= SAME_ANGLE and self.length <= SAME_LENGTH)
+
+
+class Twin(NamedTuple):
+    """Another descent to the lowest loss, refined in the same way."""
+
+    error: float
+    """Its validation error (without validation, training error) relative to that of the fit."""
+    off: Difference
+
+    @property
+    def same(self) -> bool:
+        """Whether both are the same arm, with the same error."""
+        return self.off.same and bool(abs(self.error - 1) <= SAME_ERROR)
+
+    @property
+    def words(self) -> str:
+        """The comparison as text."""
+        kind = "the same arm" if self.same else "another arm"
+        angle, length = np.degrees(self.off.angle), 1e3 * self.off.length
+        return f"{kind} (axes within {angle:.2g}° and {length:.2g} mm, error {self.error:.3g} times)"
+
+
+def difference(first: Frames, second: Frames, structure: Structure) -> Difference:
+    """Compares two arms of the same structure."""
+    gravity = structure.acceleration > 0
+    one = lines_of(first, structure.parents, gravity=gravity)
+    turning = np.array([kind == "revolute" for kind in structure.joints])
+    others = second, mirror_image(second, structure.parents, structure.joints)
+    offsets = [_aligned(one, lines_of(other, structure.parents, gravity=gravity), turning) for other in others]
+    return min(offsets, key=lambda off: off.size)
+
+
+def lines_of(frames: Frames, parents: Sequence[int], *, gravity: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of the joint axes [d, 3], followed by that of gravity, and points on the axes [d, 3], at q = 0."""
+    d = len(parents)
+    # The ground comes last, where the index -1 points.
+    rotations, points = np.tile(np.eye(3), (d + 1, 1, 1)), np.zeros((d + 1, 3))
+    for link, parent in enumerate(parents):
+        rotations[link] = rotations[parent] @ frames.rotations[link]
+        points[link] = points[parent] + rotations[parent] @ frames.positions[link]
+    return np.append(rotations[:d, :, 2], -rotations[d:, :, 2] if gravity else np.zeros((0, 3)), axis=0), points[:d]
+
+
+def _aligned(
+    one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray], turning: np.ndarray
+) -> Difference:
+    (ours, points), (theirs, _) = one, other
+    axes = ours[: len(points)]
+    centres = [p - p[turning].mean(axis=0) if turning.any() else p for _, p in (one, other)]
+
+    def errors(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        R = Rotation.from_rotvec(x[:3]).as_matrix()
+        apart = centres[1] @ R.T + x[3:] - centres[0]
+        across = apart - np.sum(apart * axes, axis=1, keepdims=True) * axes
+        return theirs @ R.T - ours, across[turning]
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        directions, across = errors(x)
+        return np.concatenate([LENGTH * directions.ravel(), across.ravel()])
+
+    first = Rotation.align_vectors(ours, theirs)[0]
+    starts = [Rotation.from_rotvec(2 * np.pi * k / TURNS * axes[-1]) * first for k in range(TURNS)]
+    solutions = [least_squares(residual, np.append(start.as_rotvec(), np.zeros(3))) for start in starts]
+    directions, across = errors(min(solutions, key=lambda solution: solution.cost).x)
+    # Angle between unit vectors from the length of the chord between them.
+    angle = 2 * np.arcsin(np.minimum(np.linalg.norm(directions, axis=1).max() / 2, 1.0))
+    return Difference(float(angle), float(np.linalg.norm(across, axis=1).max(initial=0.0)))

@@ -26,7 +26,7 @@ from dln_jax.identification.identify import identify, parameters_of
 from dln_jax.identification.rigid_tree import choose_terms
 from dln_jax.learning.friction import Terms, fit_friction
 from dln_jax.learning.linear import fit_linear
-from dln_jax.learning.weak_forms import fit_momentum
+from dln_jax.learning.momentum import fit_momentum
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees.description import Tree, dh_frames, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters

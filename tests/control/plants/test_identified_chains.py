@@ -8,7 +8,7 @@ from calls import one_line
 from dln_jax.control.closed_loop import Hardware
 from dln_jax.control.plants.exploring import Exploration, explore
 from dln_jax.control.plants.mujoco_plants import mujoco_plant
-from dln_jax.learning.weak_forms import identified_chain, prepare
+from dln_jax.learning.recordings import identified_chain, prepare
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo simulates the plant; it is in the extra [robot]")
 BLIND = Exploration(seconds=12.0, blind=(0.3, 0.4, 0.5, 0.6), surplus=())

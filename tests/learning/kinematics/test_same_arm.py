@@ -3,9 +3,9 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dln_jax.learning.kinematics.agreement import difference
 from dln_jax.learning.kinematics.frames import Frames, mirror_image, random_frames, turn_round
 from dln_jax.learning.kinematics.projection import Structure
+from dln_jax.learning.kinematics.search import difference
 
 D = 4
 CHAIN = Structure((-1, 0, 1, 2), ("revolute",) * D, 9.81, True, 0.01)

@@ -1,0 +1,230 @@
+"""Fits models to q, qd and torques by the equations of motion in weak form, without accelerations.
+
+With the momentum p = M(q) qd, tau = dp/dt + s(q, qd), where s = tau(q, qd, 0) - dM/dt qd holds gravity, friction and
+the rest of the Coriolis forces. Multiplied by a window w(t) that is zero at both ends, and integrated by parts:
+
+    - integral w' p dt + integral w s dt = integral w tau dt
+
+(modulating functions, Shinbrot 1957; for robots the filtered forms of Slotine and Li 1987.) Accelerations, whose noise
+grows with the square of the frequency, do not appear. Both sides pass through the same low-pass, so that dry friction
+is not distorted, and the result hardly depends on the cut-off of q. Torques that are held between samples are no harder
+to fit than smooth ones. The windows are sin⁴ (pi t / W); plain sums over their samples are as accurate as the motion is
+smooth.
+
+`fit_momentum` fits any model that is linear in its parameters: one equation per joint and window. `momentum_errors` are
+the residuals of any other model, and `acceleration_misfit` compares models of one plant.
+"""
+
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float, Int
+
+from dln_jax.data.encoders.sampling import EVEN
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import segments
+from dln_jax.learning.linear import unravelled
+from dln_jax.learning.objectives import torque_scale
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.model import Model
+from dln_jax.precision import quick_compilation
+from dln_jax.solvers import least_squares
+from dln_jax.solvers.normal_equations import count
+from dln_jax.types import InputError, Vector, require_positive
+
+WINDOW = 0.16
+"""Length of a window in s: about two periods of the highest frequency that a low-pass at 12 Hz passes."""
+FEWEST = 8
+"""Smallest number of steps of a window."""
+OVERLAP = 5
+"""Number of windows that start within the length of one; more would be nearly redundant."""
+CHUNK = 4096
+"""Samples whose columns are in memory at a time."""
+ROUNDS = 10
+"""Largest number of reweighted fits; three to five are usual."""
+SETTLED = 0.01
+"""Relative change of the errors' covariance that ends them."""
+
+
+class WeakFit(NamedTuple):
+    """Identified parameters, and how well the data determine them; otherwise as `learning.linear.LinearFit`."""
+
+    parameters: Any
+    """Parameters of the model, in its dtype."""
+    parameter_count: int
+    rank: int
+    condition: float
+    errors: Float[np.ndarray, "W d"]
+    """Error of every window's mean torques, N m or N."""
+
+
+class MomentumWindows(NamedTuple):
+    """W windows of S steps."""
+
+    q: Float[np.ndarray, "W S+1 d"]
+    qd: Float[np.ndarray, "W S+1 d"]
+    impulse: Float[np.ndarray, "W d"]
+    """Integral of w tau dt, N m or N: a mean torque if the integral of w is 1."""
+    dt: float
+    trajectory: Int[np.ndarray, " W"]
+
+
+def fit_momentum(
+    model: Model,
+    data: Trajectories,
+    *,
+    window: float = WINDOW,
+    noise: Float[np.ndarray, " d"] | None = None,
+    reweighted: bool = False,
+    **tolerances: Any,
+) -> WeakFit:
+    """Fits the momenta of windows by least squares, in float64; qdd is not read.
+
+    Args:
+        model: linear in its parameters, such as `models.make_rigid_tree` and `models.make_trigonometric`.
+        data: at equal time steps, with smooth velocities and measured torques, such as from `data.encoders.smooth`.
+        window: length in s, at least `FEWEST` steps.
+        noise: deviations of the torques' noise that divide the equations (default: those of the torques themselves).
+        reweighted: weight the equations by the covariance of their own errors until it settles (iterated generalised
+            least squares, Zellner 1962). Noise of encoders enters the equations of all joints through the mass matrix.
+            Without its correlations, equations without a motor, which zero parameters satisfy, pull those of a plant
+            with weak motors towards zero.
+        tolerances: ridge, rank_tolerance and negligible of `solvers.least_squares.solve`.
+
+    Raises:
+        InputError: unequal steps, no segment as long as a window, torques that do not vary, or settings out of range.
+    """
+    require_positive(window=window)
+    d, like = data.degrees_of_freedom, jax.eval_shape(model.init, jax.random.key(0))
+    with jax.enable_x64(True):
+        scale = np.asarray(torque_scale(data)) if noise is None else np.asarray(noise, float)
+        if scale.shape != (d,) or not (scale > 0).all():
+            raise InputError(f"noise is {scale}; expected a positive number for each of {d} joints")
+        equations = list(_equations(functools.partial(_columns(model), np.zeros(count(like))), data, window))
+
+    def solve(factor: np.ndarray) -> tuple[least_squares.LeastSquaresSolution, np.ndarray]:
+        """Solution and errors [W, d] of equations whose errors have the covariance factor factorᵀ."""
+        weighted = (
+            (np.linalg.solve(factor, A).reshape(b.size, -1), np.linalg.solve(factor, b[..., None]).ravel())
+            for A, b in equations
+        )
+        solution = least_squares.solve_chunks(weighted, **tolerances)
+        return solution, np.concatenate([A @ solution.x - b for A, b in equations])
+
+    factor = np.diag(scale)
+    solution, errors = solve(factor)
+    for _ in range(1, ROUNDS if reweighted else 1):
+        covariance = errors.T @ errors / len(errors)
+        change = np.linalg.solve(factor, np.linalg.solve(factor, covariance).T) - np.eye(d)
+        if np.abs(change).max() < SETTLED:
+            break
+        try:
+            factor = np.linalg.cholesky(covariance)
+        except np.linalg.LinAlgError:
+            break  # exact data leave no errors
+        solution, errors = solve(factor)
+    parameters = jax.tree.map(
+        lambda leaf, as_built: jnp.asarray(leaf, as_built.dtype), unravelled(solution.x, like), like
+    )
+    return WeakFit(parameters, solution.x.size, solution.rank, solution.condition, errors)
+
+
+def momentum_and_rest(plant: Dynamics, q: Vector, qd: Vector) -> tuple[Vector, Vector]:
+    """p = M qd and s = tau(q, qd, 0) - dM/dt qd of one state: tau = dp/dt + s."""
+    p, change = jax.jvp(lambda place: plant.mass_matrix(place) @ qd, (q,), (qd,))
+    return p, plant.inverse_dynamics(q, qd, jnp.zeros_like(qd)) - change
+
+
+def window_weights(steps: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """w dt and w' dt [steps + 1] of a window of this number of steps, scaled so that the integral of w is 1."""
+    phase = np.pi * np.arange(steps + 1) / steps
+    w, slope = np.sin(phase) ** 4, 4 * np.pi / (steps * dt) * np.sin(phase) ** 3 * np.cos(phase)
+    return w / w.sum(), slope / w.sum()
+
+
+@functools.lru_cache(maxsize=4)
+def _columns(model: Model) -> Callable[..., Array]:
+    """(theta [P], q, qd as [N, d]) -> derivatives [N, 2 d, P] of momentum and rest by theta, compiled."""
+    like = jax.eval_shape(model.init, jax.random.key(0))
+
+    def both(theta: Array, q: Vector, qd: Vector) -> Array:
+        return jnp.concatenate(momentum_and_rest(dynamics(model.energies(unravelled(theta, like))), q, qd))
+
+    return jax.jit(jax.vmap(jax.jacrev(both), in_axes=(None, 0, 0)), compiler_options=quick_compilation())
+
+
+def _cut(data: Trajectories, window: float) -> tuple[list[Int[np.ndarray, "W S+1"]], float]:
+    """Samples of overlapping windows in every gapless segment that is long enough, and their time step.
+
+    Raises:
+        InputError: unequal steps, or no segment is long enough.
+    """
+    pieces = segments(data.t, data.trajectory)
+    dt = float(np.median(np.concatenate([np.diff(data.t[piece]) for piece in pieces])))
+    steps = max(FEWEST, round(window / dt))
+    for piece in pieces:
+        late = np.abs(data.t[piece] - data.t[piece[0]] - dt * np.arange(len(piece)))
+        if len(piece) > FEWEST and late.max() > 10 * EVEN * dt * len(piece):
+            raise InputError("steps in time are not equal, as windows take them; resample with data.encoders.smooth")
+    windows = [np.lib.stride_tricks.sliding_window_view(piece, steps + 1) for piece in pieces if len(piece) > steps]
+    if not windows:
+        raise InputError(f"no segment of the data is as long as a window of {window:g} s; give a shorter one")
+    return [own[:: max(1, steps // OVERLAP)] for own in windows], dt
+
+
+def _equations(
+    program: Callable[..., Array], data: Trajectories, window: float
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Columns [W, d, P] and right-hand sides [W, d] of windows, one chunk after the other."""
+    pieces, dt = _cut(data, window)
+    steps, d = pieces[0].shape[1] - 1, data.degrees_of_freedom
+    w, slope = window_weights(steps, dt)
+    apart = max(1, steps // OVERLAP)
+    together = min(max(map(len, pieces)), max(1, (CHUNK - steps) // apart))
+    for piece in pieces:
+        for rows in (piece[first : first + together] for first in range(0, len(piece), together)):
+            first, last = rows[0, 0], rows[-1, -1]
+            # All chunks have the same length, so that one program serves them; the last ones repeat a sample.
+            samples = np.minimum(first + np.arange((together - 1) * apart + steps + 1), last)
+            values = np.asarray(program(data.q[samples], data.qd[samples]))
+            columns = [
+                np.tensordot(w, values[own, d:], 1) - np.tensordot(slope, values[own, :d], 1) for own in rows - first
+            ]
+            yield np.stack(columns), np.einsum("s,wsd->wd", w, data.tau[rows])
+
+
+def cut_momentum_windows(data: Trajectories) -> MomentumWindows:
+    """Cuts overlapping windows within gapless segments; `InputError` as for `fit_momentum`."""
+    pieces, dt = _cut(data, WINDOW)
+    rows = np.concatenate(pieces)
+    w, _ = window_weights(rows.shape[1] - 1, dt)
+    impulse = np.einsum("s,wsd->wd", w, data.tau[rows])
+    return MomentumWindows(data.q[rows], data.qd[rows], impulse, dt, data.trajectory[rows[:, 0]])
+
+
+def momentum_errors(plant: Dynamics, q: Array, qd: Array, impulse: Array, *, dt: float) -> Array:
+    """Residual of one window's equations [d], in N m or N."""
+    w, slope = map(jnp.asarray, window_weights(q.shape[0] - 1, dt))
+    p, rest = jax.vmap(lambda q, qd: momentum_and_rest(plant, q, qd))(q, qd)
+    return w @ rest - slope @ p - impulse
+
+
+def window_errors(plant: Dynamics, windows: MomentumWindows) -> Float[Array, "W d"]:
+    """Residuals of the equations of all windows, N m or N."""
+    return jax.vmap(lambda *window: momentum_errors(plant, *window, dt=windows.dt))(*map(jnp.asarray, windows[:3]))
+
+
+def acceleration_misfit(plant: Dynamics, windows: MomentumWindows) -> Array:
+    """Half the log determinant of the covariance of acceleration errors: residuals divided by M in a window's middle.
+
+    It compares models of one plant. Residuals alone favour models with small parameters if a joint has no motor.
+    """
+    masses = jax.vmap(plant.mass_matrix)(jnp.asarray(windows.q[:, windows.q.shape[1] // 2]))
+    errors = jnp.linalg.solve(masses, window_errors(plant, windows)[..., None])[..., 0]
+    return jnp.linalg.slogdet(errors.T @ errors / len(errors))[1] / 2
