@@ -8,9 +8,8 @@ structured-hnn, black-box-hnn, pairwise-hnn (bodies), polynomial-hamiltonian (on
 learned where the needs state it. Load the model with dln_jax.load.
 """
 
-import functools
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, make_dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -127,16 +126,35 @@ class Direct:
     """planar-chain: joint angles, or angles from the vertical (default: relative)."""
 
 
-@functools.cache
-def options_with(*kinds: type) -> type:
-    """The dataclass of all options of these kinds."""
-    return make_dataclass("Options", [], bases=kinds, frozen=True)
+@dataclass(frozen=True)
+class GeneratedNetwork(Networks, Generated, Motion):
+    """A network, and generated motions to train it on."""
+
+
+@dataclass(frozen=True)
+class GeneratedDirect(Direct, Generated, Motion):
+    """A model without a network, and generated motions to fit it to."""
+
+
+@dataclass(frozen=True)
+class RecordedNetwork(Networks, Recorded, Motion):
+    """A network, and recorded motions to train it on."""
+
+
+@dataclass(frozen=True)
+class RecordedDirect(Direct, Recorded, Motion):
+    """A model without a network, and recorded motions to fit it to."""
+
+
+Options = GeneratedNetwork | GeneratedDirect | RecordedNetwork | RecordedDirect
 
 
 def class_of(stated: Mapping[str, Any]) -> type:
     """Options of the task and the model that a command line selects."""
-    model = Direct if stated.get("model") in DIRECT else Networks
-    return options_with(model, Recorded if stated.get("task") in RECORDED else Generated, Motion)
+    network, direct = GeneratedNetwork, GeneratedDirect
+    if stated.get("task") in RECORDED:
+        network, direct = RecordedNetwork, RecordedDirect
+    return direct if stated.get("model") in DIRECT else network
 
 
 @dataclass(frozen=True)
@@ -154,7 +172,7 @@ class Arguments(Motion):
     )
 
 
-def main(options: Motion) -> None:
+def main(options: Options) -> None:
     """Trains and evaluates the model, and writes the run folder.
 
     Raises:
@@ -193,7 +211,7 @@ def main(options: Motion) -> None:
         known = {"needs": needs_of(options.needs), "test": options.test, "noise": noise}
         log = read_motions(options.task, options.data, **known, **facts(options))
     else:
-        log = generate(options.task, getattr(options, "trajectories", None))
+        log = generate(options.task, options.trajectories)
     if options.model == POLYNOMIAL:
         if optimizer == "adam":
             raise InputError("the polynomial model is one least-squares problem; leave --optimizer out")

@@ -111,7 +111,10 @@ def _texts(arguments: type) -> dict[str, str]:
     """The string below each field, also of base classes."""
     texts = {}
     for one in reversed([one for one in arguments.__mro__ if dataclasses.is_dataclass(one)]):
-        body = ast.parse(textwrap.dedent(inspect.getsource(one))).body[0]
+        try:
+            body = ast.parse(textwrap.dedent(inspect.getsource(one))).body[0]
+        except OSError:  # a class that was made at run time, whose fields state their texts
+            continue
         assert isinstance(body, ast.ClassDef)
         for field, below in zip(body.body, body.body[1:], strict=False):
             if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
