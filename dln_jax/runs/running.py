@@ -55,9 +55,9 @@ def run(
             sys.stdout.flush()  # the help; raises BrokenPipeError here if its reader has closed the pipe
         require_possible(own)
         # JAX takes a second to import, which the help and a mistake do not need.
-        from dln_jax import scale
         from dln_jax.runs import compilation_cache, scaled
         from dln_jax.runs.folder import with_stored_arguments
+        from dln_jax.scale import losses_named
 
         # Data and references are float64; models state their own precision.
         compilation_cache.enable_double_precision()
@@ -69,7 +69,7 @@ def run(
     start = began if began is not None else time.perf_counter()
 
     def work(options: Any) -> None:
-        with as_one_line(prog, options), scale.losses_named(scaled.remedy_of(options)), counting_from(start):
+        with as_one_line(prog, options), losses_named(scaled.remedy_of(options)), counting_from(start):
             main(options)
             if before and (text := compilation_cache.summary(before, unkept)):
                 print(text)

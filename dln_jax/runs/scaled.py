@@ -13,10 +13,9 @@ from typing import Any, NoReturn
 import jax
 from jax.sharding import Mesh
 
-from dln_jax import scale
 from dln_jax.files import PARTIAL
 from dln_jax.runs.options import Drawn, Scaled
-from dln_jax.scale import Membership, backend_started, batch_mesh
+from dln_jax.scale import JOINING, Membership, backend_started, batch_mesh, host_devices, join, membership
 from dln_jax.types import InputError
 
 
@@ -40,18 +39,18 @@ def membership_in(options: Any) -> Membership | None:
     """
     if not isinstance(options, Scaled):
         return None
-    scale.host_devices(options.devices)
-    member = scale.membership(options.processes, options.coordinator, options.process_id)
+    host_devices(options.devices)
+    member = membership(options.processes, options.coordinator, options.process_id)
     if member is not None and getattr(options, "out", None) is None:
         raise InputError("several processes share their run's folder; name one that all hosts see, by --out")
     return member
 
 
-def joined(member: Membership, options: Any, *, seconds: int = scale.JOINING) -> Any:
+def joined(member: Membership, options: Any, *, seconds: int = JOINING) -> Any:
     """Joins the other processes of a command and returns the arguments of this one.
 
     Raises:
-        InputError: JAX has been used. Errors of `scale.join` end the process with one line and status 2.
+        InputError: JAX has been used. Errors of `join` end the process with one line and status 2.
     """
     if backend_started():
         raise InputError("JAX has been used in this process; several are started before it is")
@@ -66,7 +65,7 @@ def joined(member: Membership, options: Any, *, seconds: int = scale.JOINING) ->
     sys.stdout = open(os.dup(1), "w", buffering=1, errors=sys.stdout.errors)  # noqa: SIM115  open until the process ends
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     try:
-        scale.join(member, shared, seconds=seconds)
+        join(member, shared, seconds=seconds)
     except (InputError, KeyboardInterrupt) as error:
         mistake = isinstance(error, InputError)
         print(f"error: {error}" if mistake else "interrupted", file=sys.stderr)
