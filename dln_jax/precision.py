@@ -98,6 +98,11 @@ def quick_compilation() -> dict[str, Any]:
     return dict(_known()) if jax.default_backend() == "cpu" else {}
 
 
+def compiled(function: Callable[..., Any]) -> Any:
+    """`jax.jit` for programs that run once or twice each, with quick compilation."""
+    return jax.jit(function, compiler_options=quick_compilation())
+
+
 @functools.cache
 def _known() -> dict[str, Any]:
     known = {}

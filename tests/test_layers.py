@@ -9,8 +9,7 @@ LAYERS = {
     "types": -3,  # symbols: everyone may read them
     "process": -3,
     "files": -2,
-    "options": -2,  # marks of options
-    "sizes": -2,
+    "options": -2,
     "precision": -2,
     "scale": 0,
     "rollout": 1,  # many steps of anything

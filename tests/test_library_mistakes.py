@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import dln_jax
-from dln_jax import sizes
 from dln_jax.data import schema
+from dln_jax.errors import memory, require_memory, require_network
 from dln_jax.learning.engine import newton
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import Problem, sharing
@@ -19,7 +19,6 @@ from dln_jax.mechanics.trees.description import make_tree
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian
 from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.pendulums import two_link_arm
-from dln_jax.sizes import memory, require_memory, require_network
 from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.scene import make_scene, with_parameters
 from dln_jax.softbody.terms.gravity import gravity

@@ -18,8 +18,8 @@ from interpreters import Program, interpreters
 
 from dln_jax.commands import COMMANDS
 from dln_jax.data import schema
+from dln_jax.options import CompilationCache
 from dln_jax.runs.arguments import names_listed, parse
-from dln_jax.runs.options import CompilationCache
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import cart_pole, pendulum
 from scripts.reports.run import arguments_of, chosen_cases

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dln_jax.errors import InputError
-from dln_jax.options import Unstated
+from dln_jax.options import Drawn, Folder, Logged, Unstated
 from dln_jax.runs.arguments import names_listed, refuse_given
-from dln_jax.runs.options import Drawn, Folder, Logged
 
 
 @dataclass(frozen=True, kw_only=True)

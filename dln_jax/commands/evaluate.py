@@ -7,7 +7,7 @@ fitted. A run folder gets the metrics, the figures and the verdict.
 from dataclasses import dataclass
 from pathlib import Path
 
-from dln_jax.runs.options import Drawn, Filtered, Folder
+from dln_jax.options import Drawn, Filtered, Folder
 
 
 @dataclass(frozen=True, kw_only=True)

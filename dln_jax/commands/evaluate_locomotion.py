@@ -8,8 +8,7 @@ without a fall, if none of them goes backwards, and refused below 50 %, with exi
 from dataclasses import dataclass
 from pathlib import Path
 
-from dln_jax.options import Unstated
-from dln_jax.runs.options import Folder
+from dln_jax.options import Folder, Unstated
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,9 +13,8 @@ from statistics import median
 from typing import Any
 
 from dln_jax.errors import InputError
-from dln_jax.options import Unstated
+from dln_jax.options import Drawn, Folder, Unstated
 from dln_jax.runs.arguments import names_listed, numbers_of
-from dln_jax.runs.options import Drawn, Folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +70,7 @@ def main(options: Arguments) -> None:
     from dln_jax.data import schema
     from dln_jax.data.csv_tables import write_motion
     from dln_jax.data.robots import read_robot
+    from dln_jax.errors import require_memory
     from dln_jax.figures.torques import excitation_figure
     from dln_jax.files import write_json
     from dln_jax.identification.excitation.design import (
@@ -88,7 +88,6 @@ def main(options: Arguments) -> None:
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import Report, finish, png
-    from dln_jax.sizes import require_memory
     from dln_jax.types import require_positive
 
     count = options.trajectories

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from dln_jax.options import Unstated, choice
-from dln_jax.runs.options import Drawn, Filtered, Folder
+from dln_jax.options import Drawn, Filtered, Folder, Unstated, choice
 
 LAWS = ("viscous", "coulomb", "stribeck", "offset", "asymmetric", "sigmoid", "load")
 """Friction laws that can be identified; load only if cross-validation favours it."""

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 from dln_jax.errors import InputError
-from dln_jax.options import Unstated
+from dln_jax.options import SceneName, Unstated
 from dln_jax.runs.arguments import refuse_given
-from dln_jax.runs.options import SceneName
 
 OF_KIND = {"characters": ("dt",), "uniform": ("samples", "seed"), "free-swing": ("trajectories", "steps", "dt", "seed")}
 """Options of each kind; unset options take the generator's defaults."""

@@ -17,8 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from dln_jax.options import Unstated
-from dln_jax.runs.options import Drawn, Folder
+from dln_jax.options import Drawn, Folder, Unstated
 
 GALLERY = (0, 3, 2, 1, 4)
 """Order of the scenes in the combined picture."""

@@ -15,9 +15,8 @@ from typing import ClassVar, Literal
 
 from dln_jax.commands import COMMANDS
 from dln_jax.errors import InputError
-from dln_jax.options import Unstated
+from dln_jax.options import Resumable, Unstated
 from dln_jax.runs.arguments import names_in, require_positive_if_given
-from dln_jax.runs.options import Resumable
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ it, the model is identified, and trials of the model choose all gains (law.json)
 from dataclasses import dataclass
 from typing import Annotated
 
-from dln_jax.options import Unstated, choice
-from dln_jax.runs.options import Drawn, Folder
+from dln_jax.options import Drawn, Folder, Unstated, choice
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,8 @@ from typing import Annotated, Any, ClassVar, Literal
 import tyro
 
 from dln_jax.learning.fits.settings import Automatic, Kernel, LearnedTree, Network, Trigonometric
-from dln_jax.options import Unstated
+from dln_jax.options import Devices, Drawn, Filtered, Limited, Logged, Resumable, Scaled, SceneName, Unstated
 from dln_jax.runs.arguments import Variants
-from dln_jax.runs.options import Devices, Drawn, Filtered, Limited, Logged, Resumable, Scaled, SceneName
 
 NETWORK, AUTO = "structured-delan", "auto"
 ModelName = Annotated[
@@ -150,7 +149,7 @@ def train(options: Options, command: str) -> None:
         InputError: a mistake in the options or data; nothing is then left behind.
         FitRefused: the model must not be used, and no limit of the user ended its training; the run folder is complete.
     """
-    from dln_jax.data.parts import split_log
+    from dln_jax.data.log import split_log
     from dln_jax.learning.engine.checkpoint import Context
     from dln_jax.learning.fit import with_uncertainty
     from dln_jax.process import deadline

@@ -7,9 +7,8 @@ model.safetensors and model.json (load them with dln_jax.load), a checkpoint to 
 from dataclasses import dataclass
 from typing import Literal
 
-from dln_jax.options import Unstated
+from dln_jax.options import Drawn, Resumable, Unstated
 from dln_jax.runs.arguments import require_positive_if_given
-from dln_jax.runs.options import Drawn, Resumable
 
 
 @dataclass(frozen=True)

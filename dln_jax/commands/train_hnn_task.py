@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from dln_jax.errors import InputError
 from dln_jax.learning.fits.settings import ActivationName
-from dln_jax.options import Unstated, choice
+from dln_jax.options import Checked, Drawn, Limited, Resumable, Scaled, Unstated, choice
 from dln_jax.runs.arguments import Variants
-from dln_jax.runs.options import Checked, Drawn, Limited, Resumable, Scaled
 
 if TYPE_CHECKING:
     from dln_jax.commands.phase_spaces.data import PhaseLog

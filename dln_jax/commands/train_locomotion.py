@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Literal
 
 from dln_jax.errors import InputError
-from dln_jax.options import Unstated
+from dln_jax.options import Drawn, Resumable, Scaled, Unstated
 from dln_jax.runs.arguments import require_positive_if_given
-from dln_jax.runs.options import Drawn, Resumable, Scaled
 
 STEPS = 400_000
 

@@ -15,9 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from dln_jax.options import Unstated, choice
+from dln_jax.options import Drawn, Resumable, Scaled, Unstated, choice
 from dln_jax.runs.arguments import Variants
-from dln_jax.runs.options import Drawn, Resumable, Scaled
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from dln_jax.errors import LARGEST, SMALLEST
 from dln_jax.files import is_file, is_folder
-from dln_jax.sizes import LARGEST, SMALLEST
 from dln_jax.types import InputError
 
 Data = TypeVar("Data")

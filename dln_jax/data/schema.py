@@ -25,8 +25,15 @@ import numpy as np
 
 from dln_jax.data import bags, csv_tables
 from dln_jax.data.arrays import load_file, numeric, unread_line
-from dln_jax.data.joint_names import OPTIONAL, PER_JOINT, match_names, scale_torques, select_names, with_selected_joints
-from dln_jax.data.stated_needs import needs_from_text
+from dln_jax.data.joints import (
+    OPTIONAL,
+    PER_JOINT,
+    match_names,
+    needs_from_text,
+    scale_torques,
+    select_names,
+    with_selected_joints,
+)
 from dln_jax.files import is_file, is_folder, writing
 from dln_jax.types import InputError, Needs, require_positive
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from dln_jax.data.joint_names import PER_JOINT, match_names
+from dln_jax.data.joints import PER_JOINT, match_names
 from dln_jax.data.schema import Trajectories
 from dln_jax.types import InputError, require_positive, require_seed
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.data.parts import Parts
+from dln_jax.data.log import Parts
 from dln_jax.learning import dynamics
 from dln_jax.learning.dynamics import summed_with_friction
 from dln_jax.learning.engine.optimisers import Optimiser

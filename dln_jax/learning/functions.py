@@ -22,6 +22,7 @@ from jaxtyping import Float
 
 from dln_jax.data.arrays import on_device
 from dln_jax.data.functions import FunctionSamples, SampleSplit
+from dln_jax.errors import require_network
 from dln_jax.learning.engine.checkpoint import Checkpoint
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser
@@ -40,7 +41,6 @@ from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers
 from dln_jax.precision import data_type
-from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Scalar, require_positive, require_seed
 
 LOSSES = ("type1", "type2")

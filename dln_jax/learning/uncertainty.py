@@ -24,6 +24,7 @@ that, a state is out of distribution if its deviation exceeds those on the data,
 For a network, every state outside that range is out of distribution.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -40,8 +41,8 @@ from dln_jax.models.uncertainty import Domain, Uncertainty
 from dln_jax.solvers.normal_equations import count
 from dln_jax.types import InputError, require_positive
 
-RIDGES = tuple(10.0**power for power in range(-18, 0, 2))
-RATIOS = (0.0, *(10.0 ** (power / 4) for power in range(-8, 25)))
+RIDGES = (1e-18, 1e-16, 1e-14, 1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2)
+RATIOS = (0.0, *map(math.pow, [10.0] * 33, np.arange(-8, 25) / 4))
 """Ratios b / a that are tried."""
 MOST_PARAMETERS, DIRECTIONS = 1_500, 400
 FOLDS = 10

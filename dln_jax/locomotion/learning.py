@@ -23,6 +23,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
+from dln_jax.errors import require_network
 from dln_jax.files import finite as finite_values
 from dln_jax.learning.engine.checkpoint import has_checkpoint, stored_rows
 from dln_jax.locomotion.task import (
@@ -37,7 +38,6 @@ from dln_jax.locomotion.task import (
 from dln_jax.precision import quick_compilation
 from dln_jax.process import held_back
 from dln_jax.scale import local, program, spread
-from dln_jax.sizes import require_network
 from dln_jax.types import InputError
 from dln_jax.zoo import parameter_files as checkpoints
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from dln_jax.data.schema import momenta
 from dln_jax.mechanics.equations import flow
@@ -122,19 +122,6 @@ def motion_errors(
     if published_energy is not None and published_energy is not H:
         errors |= over_all("published_energy_mse", functools.partial(energy_errors, published_energy))
     return errors | over_all("rollout_mse", state_errors)
-
-
-def quarter_period(states: Float[np.ndarray, "K T n"], bounded: Bool[np.ndarray, " n"]) -> int:
-    """Returns the system's own time in samples: the first lag at which motions no longer correlate with themselves.
-
-    It is a quarter of the period of an oscillation. Every column counts alike; angles, which may turn over, enter by
-    their cosine and sine. Noise that is independent between samples does not matter.
-    """
-    parts = np.stack([np.where(bounded, states, np.cos(states)), np.where(bounded, 0.0, np.sin(states))])
-    about = parts - parts.mean(axis=2, keepdims=True)
-    size = np.sqrt(np.sum(about**2, axis=(0, 1, 2)))
-    spectrum = np.abs(np.fft.rfft(about / np.where(size > 0, size, 1.0), 2 * states.shape[1], axis=2)) ** 2
-    return max(int(np.argmax(np.fft.irfft(spectrum.sum(axis=(0, 1, 3)))[: states.shape[1]] <= 0)), 1)
 
 
 def free_motions(

@@ -35,7 +35,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import uniform_filter1d
 
-from dln_jax.metrics.phase_space import Motions, free_motions, quarter_period
+from dln_jax.metrics.phase_space import Motions, free_motions
 from dln_jax.types import InputError
 
 Level = Literal["good", "doubtful", "refused"]
@@ -286,3 +286,16 @@ def _numbers(errors: HeldOut, share: np.ndarray, noise: np.ndarray, names: Seque
 
 def _listed(names: Sequence[str], chosen: np.ndarray) -> str:
     return ", ".join(itertools.compress(names, chosen))
+
+
+def quarter_period(states: Float[np.ndarray, "K T n"], bounded: Bool[np.ndarray, " n"]) -> int:
+    """Returns the system's own time in samples: the first lag at which motions no longer correlate with themselves.
+
+    It is a quarter of the period of an oscillation. Every column counts alike; angles, which may turn over, enter by
+    their cosine and sine. Noise that is independent between samples does not matter.
+    """
+    parts = np.stack([np.where(bounded, states, np.cos(states)), np.where(bounded, 0.0, np.sin(states))])
+    about = parts - parts.mean(axis=2, keepdims=True)
+    size = np.sqrt(np.sum(about**2, axis=(0, 1, 2)))
+    spectrum = np.abs(np.fft.rfft(about / np.where(size > 0, size, 1.0), 2 * states.shape[1], axis=2)) ** 2
+    return max(int(np.argmax(np.fft.irfft(spectrum.sum(axis=(0, 1, 3)))[: states.shape[1]] <= 0)), 1)

@@ -26,12 +26,12 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float
 
+from dln_jax.errors import require_network
 from dln_jax.mechanics.arguments import vectors
 from dln_jax.mechanics.dynamics import InverseForward, PhaseRates
 from dln_jax.models.model import Model, Scale, inputs_of, model_of, per_coordinate, perceptrons, unsaturated
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.nn.differential_mlp import Layers, init_ensemble, layer_shapes, value_jacobian_and_hessian
-from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Needs, Scalar, Vector, VectorLike, require_positive
 
 FIELDS = ("solenoidal", "conservative", "both")

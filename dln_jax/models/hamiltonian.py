@@ -41,6 +41,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
+from dln_jax.errors import require_network
 from dln_jax.mechanics.equations import Canonical
 from dln_jax.mechanics.hamiltonian import Guess, HamiltonianSystem
 from dln_jax.mechanics.natural import NaturalHamiltonian
@@ -57,7 +58,6 @@ from dln_jax.models.model import (
     viscous_dissipation,
 )
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Matrix, Needs, Scalar, Vector, require_positive
 
 

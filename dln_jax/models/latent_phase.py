@@ -27,6 +27,7 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float
 
+from dln_jax.errors import require_network
 from dln_jax.mechanics.arguments import vectors
 from dln_jax.mechanics.dynamics import Flow, PhaseRates, PlainFlow
 from dln_jax.mechanics.equations import flow
@@ -35,7 +36,6 @@ from dln_jax.models.baselines import make_phase_network
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian
 from dln_jax.models.model import Model
 from dln_jax.nn.activations import Activation, silu, tanh
-from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Needs, require_positive
 
 NEEDS = Needs(joints=("prismatic",))

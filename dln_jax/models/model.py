@@ -30,13 +30,13 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
+from dln_jax.errors import require_network
 from dln_jax.mechanics.arguments import require_shape
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.nn.activations import activation as activation_of
-from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Matrix, Needs, Scalar, Vector, require_positive
 
 Parameters = Any

@@ -16,11 +16,11 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
+from dln_jax.errors import require_network
 from dln_jax.mechanics.residual import Residual, with_residual
 from dln_jax.models.model import Model, Parameters, Scale, joint_features, model_of, per_coordinate
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.nn.activations import activation as activation_of
-from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Matrix, Needs, ResidualTerm, Scalar, Vector
 
 TERMS: tuple[ResidualTerm, ...] = get_args(ResidualTerm)

@@ -12,10 +12,9 @@ import tyro
 from tyro._errors import BadValue, InstantiationFailure, InvalidChoice, ParseErrorEvent, on_parse_error
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from dln_jax.errors import InputError
+from dln_jax.errors import InputError, require_magnitude
+from dln_jax.options import Checked, Filtered, Logged
 from dln_jax.runs.help import help_text
-from dln_jax.runs.options import Checked, Filtered, Logged
-from dln_jax.sizes import require_magnitude
 
 if TYPE_CHECKING:
     from dln_jax.types import Needs
@@ -269,7 +268,7 @@ def cutoff(text: str | None) -> Any:
 
 def needs_of(text: str | None) -> "Needs | None":
     """Parses --needs; `InputError` if the text does not state valid needs."""
-    from dln_jax.data.stated_needs import needs_from_text  # imports JAX
+    from dln_jax.data.joints import needs_from_text  # imports JAX
 
     try:
         return None if text is None else needs_from_text(text)

@@ -9,15 +9,13 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from dln_jax.data.log import Log
-from dln_jax.data.parts import Parts
+from dln_jax.data.log import Log, Parts
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import merged
 from dln_jax.figures.torques import force_decomposition, tip_paths, torque_bands
 from dln_jax.figures.training import training_curve
 from dln_jax.learning.engine.optimisers import Adam, name_of
 from dln_jax.learning.fit import Fit, double
-from dln_jax.learning.latency import latency_of
 from dln_jax.learning.linear import design, design_chunks
 from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
 from dln_jax.mechanics.equations import dynamics
@@ -33,8 +31,8 @@ from dln_jax.metrics.errors import (
 from dln_jax.metrics.motions import Motion, by_trajectory, metrics_of_motions, motion_program, records_of
 from dln_jax.models.model import Model
 from dln_jax.models.uncertainty import Uncertainty, deviation_of_rows, exceeds, scores_of_rows
-from dln_jax.precision import quick_compilation
-from dln_jax.runs.report import Report, cost_metrics, number, png, unit_of
+from dln_jax.precision import compiled
+from dln_jax.runs.report import Report, cost_metrics, latency_of, number, png, unit_of
 from dln_jax.runs.verdict import verdict_of
 from dln_jax.types import InputError
 
@@ -137,11 +135,6 @@ def evaluate(
         lines=tuple(lines_on(fit, parts)),
         error=failure(fit),
     )
-
-
-def compiled(function: Callable[..., Any]) -> Any:
-    """`jax.jit` for programs that run once or twice each, with quick compilation."""
-    return jax.jit(function, compiler_options=quick_compilation())
 
 
 def rollouts(

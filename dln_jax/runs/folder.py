@@ -16,8 +16,8 @@ from jax.experimental import multihost_utils
 
 from dln_jax.errors import InputError
 from dln_jax.files import PARTIAL, as_type, is_file, is_folder, read_json, write_json
+from dln_jax.options import Scaled
 from dln_jax.runs.arguments import arguments_for
-from dln_jax.runs.options import Scaled
 from dln_jax.runs.scaled import copied_folder
 
 CONFIG = "config.json"

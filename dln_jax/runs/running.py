@@ -10,11 +10,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from dln_jax.errors import FitRefused, InputError, ProcessLost
+from dln_jax.errors import FitRefused, InputError, ProcessLost, require_magnitude, require_within
+from dln_jax.options import CompilationCache, NoCompilationCache, Scaled
 from dln_jax.process import counting_from
 from dln_jax.runs.arguments import parse
-from dln_jax.runs.options import CompilationCache, NoCompilationCache
-from dln_jax.sizes import require_magnitude, require_within
 
 MOST_CHARACTERS = 400
 """Characters shown at either end of a long message; the middle is left out."""
@@ -61,7 +60,7 @@ def run(
 
         # Data and references are float64; models state their own precision.
         compilation_cache.enable_double_precision()
-        member = scaled.membership_in(own)
+        member = scaled.membership_in(own) if isinstance(own, Scaled) else None
         options = with_stored_arguments(own, arguments) if getattr(own, "resume", False) else own
         before = compilation_cache.compilation().copy() if from_shell else None
         unkept = compilation_cache.keep(shared.compilation_cache) if from_shell else ""
@@ -69,7 +68,8 @@ def run(
     start = began if began is not None else time.perf_counter()
 
     def work(options: Any) -> None:
-        with as_one_line(prog, options), losses_named(scaled.remedy_of(options)), counting_from(start):
+        lost = contextlib.nullcontext() if member is None else losses_named(scaled.remedy_of(options))
+        with as_one_line(prog, options), lost, counting_from(start):
             main(options)
             if before and (text := compilation_cache.summary(before, unkept)):
                 print(text)

@@ -14,7 +14,7 @@ import jax
 from jax.sharding import Mesh
 
 from dln_jax.files import PARTIAL
-from dln_jax.runs.options import Drawn, Scaled
+from dln_jax.options import Drawn
 from dln_jax.scale import JOINING, Membership, backend_started, batch_mesh, host_devices, join, membership
 from dln_jax.types import InputError
 
@@ -37,8 +37,6 @@ def membership_in(options: Any) -> Membership | None:
     Raises:
         InputError: the options or the cluster's environment variables are inconsistent, or --out is missing.
     """
-    if not isinstance(options, Scaled):
-        return None
     host_devices(options.devices)
     member = membership(options.processes, options.coordinator, options.process_id)
     if member is not None and getattr(options, "out", None) is None:

@@ -6,12 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dln_jax.data.log import Log, log_of, read_log
-from dln_jax.data.parts import Parts, split_log
+from dln_jax.data.joints import needs_from_json
+from dln_jax.data.log import Log, Parts, log_of, read_log, split_log
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, select_samples
-from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.learning.fit import Fit, with_uncertainty
 from dln_jax.learning.fits.settings import WAYS

@@ -4,8 +4,7 @@ import jax
 import numpy as np
 
 from dln_jax.data.encoders.sampling import torque_noise
-from dln_jax.data.log import Log
-from dln_jax.data.parts import Parts
+from dln_jax.data.log import Log, Parts
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import merged

@@ -18,12 +18,12 @@ from typing import Any, Literal, get_args, get_origin
 import numpy as np
 
 from dln_jax.data.arrays import spread
+from dln_jax.data.joints import needs_from_json
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.stated_needs import needs_from_json
+from dln_jax.errors import require_network
 from dln_jax.files import as_type
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.precision import data_type, require_precision
-from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.catalogue import CATALOGUE, assembled, entry_of
 from dln_jax.zoo.parameter_files import REMEDY

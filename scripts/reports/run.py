@@ -17,10 +17,10 @@ import tyro
 
 from dln_jax.files import as_type, is_file, read_json, write_bytes, write_json
 from dln_jax.metrics.report import Row, conditions, write_report
+from dln_jax.options import Resumable
 from dln_jax.precision import in_float64
 from dln_jax.runs.arguments import names_listed
 from dln_jax.runs.folder import command_folder
-from dln_jax.runs.options import Resumable
 from dln_jax.runs.running import run
 from dln_jax.types import InputError
 

@@ -10,8 +10,7 @@ from planar_arm import FRICTION, URDF, motions
 
 from dln_jax import load, load_c, read_robot
 from dln_jax.commands import identify
-from dln_jax.data.log import log_of
-from dln_jax.data.parts import split_log
+from dln_jax.data.log import log_of, split_log
 from dln_jax.export.c.run import export_run
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")

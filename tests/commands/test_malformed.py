@@ -23,8 +23,8 @@ from dln_jax.commands import (
     train_locomotion,
 )
 from dln_jax.data import arrays, functions, meshes, schema
+from dln_jax.data.joints import needs_from_text
 from dln_jax.data.splits import split
-from dln_jax.data.stated_needs import needs_from_text
 from dln_jax.files import write_json
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.problem import Progress

@@ -11,8 +11,7 @@ from planar_arm import ARM, FRICTION, motions
 from dln_jax import InputError, dynamics, joint_dissipation, load, tree_system
 from dln_jax.commands import train_delan
 from dln_jax.data import schema
-from dln_jax.data.log import read_log
-from dln_jax.data.parts import split_log
+from dln_jax.data.log import read_log, split_log
 from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import Robot
 from dln_jax.learning.engine.checkpoint import Context

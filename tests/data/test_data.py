@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax import Needs
 from dln_jax.data import schema
+from dln_jax.data.joints import needs_from_json
 from dln_jax.data.splits import PER_SAMPLE, merged, select, split
-from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import cart_pole, pendulum, two_link_arm
 

@@ -5,7 +5,7 @@ from calls import one_line
 from numpy.testing import assert_array_equal
 
 from dln_jax.data import schema
-from dln_jax.data.joint_names import match_names, scale_torques, select_names
+from dln_jax.data.joints import match_names, scale_torques, select_names
 from dln_jax.data.splits import in_blocks, with_joints
 
 ARRAYS = {

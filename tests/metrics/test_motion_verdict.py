@@ -4,8 +4,8 @@ has to do better than rest and straight lines after the samples that its start s
 import numpy as np
 import pytest
 
-from dln_jax.metrics.phase_space import Motions, quarter_period
-from dln_jax.metrics.verdict import judge_motions
+from dln_jax.metrics.phase_space import Motions
+from dln_jax.metrics.verdict import judge_motions, quarter_period
 
 T = np.linspace(0, 10, 200)
 PHASES = np.linspace(0, 6, 8)[:, None]

@@ -16,9 +16,9 @@ from dln_jax.data.functions import PUBLISHED
 from dln_jax.learning.fits.settings import WAYS
 from dln_jax.mechanics.friction import LAWS, USUAL
 from dln_jax.nn.activations import ALL
+from dln_jax.options import SCENES
 from dln_jax.runs.arguments import arguments_for, resolved
 from dln_jax.runs.help import options_of
-from dln_jax.runs.options import SCENES
 from dln_jax.runs.running import run
 from dln_jax.scenes import registry
 from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS

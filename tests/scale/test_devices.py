@@ -9,7 +9,7 @@ import pytest
 
 from dln_jax import precision, scale
 from dln_jax.export.low_latency import enable_low_latency, low_latency
-from dln_jax.runs.options import Scaled
+from dln_jax.options import Scaled
 from dln_jax.runs.running import run
 from dln_jax.types import InputError
 

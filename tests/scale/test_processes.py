@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.runs.options import Resumable, Scaled
+from dln_jax.options import Resumable, Scaled
 from dln_jax.runs.progress import progress
 from dln_jax.runs.running import run
 from dln_jax.runs.folder import command_folder

@@ -12,8 +12,7 @@ from motions import sums_of_sines
 from dln_jax import Needs
 from dln_jax.commands import train_delan
 from dln_jax.data import schema
-from dln_jax.data.log import read_log
-from dln_jax.data.parts import split_log
+from dln_jax.data.log import read_log, split_log
 from dln_jax.data.schema import from_arrays
 from dln_jax.learning.dynamics import summed_with_friction
 from dln_jax.learning.engine.checkpoint import Context

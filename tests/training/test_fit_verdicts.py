@@ -4,8 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax import LagrangianSystem, Needs
-from dln_jax.data.log import Log
-from dln_jax.data.parts import Parts
+from dln_jax.data.log import Log, Parts
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import Split, select
 from dln_jax.learning.fit import Fit

@@ -19,8 +19,7 @@ from dln_jax.commands.identification.motions import (
 )
 from dln_jax.commands.identification.verdict import Predict, judge_robot
 from dln_jax.commands.identify import LAWS, NO_FRICTION, TEMPERATURE, Arguments
-from dln_jax.data.log import SPLIT, read_log
-from dln_jax.data.parts import Parts, split_log
+from dln_jax.data.log import SPLIT, Parts, read_log, split_log
 from dln_jax.data.robot_files import write_robot
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.splits import Split, is_cut
@@ -37,6 +36,7 @@ from dln_jax.mechanics.trees.motors import Pair, armature_matrix, require_motors
 from dln_jax.metrics.errors import mean_square, normalised_error
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.trees import RigidTreeParameters, Rows, pairs_of
+from dln_jax.precision import compiled
 from dln_jax.runs.arguments import (
     facts,
     names_in,
@@ -45,7 +45,7 @@ from dln_jax.runs.arguments import (
     refuse_given,
     require_positive_if_given,
 )
-from dln_jax.runs.evaluation import bands_of, compiled
+from dln_jax.runs.evaluation import bands_of
 from dln_jax.runs.folder import command_folder
 from dln_jax.runs.report import Report, finish, png
 from dln_jax.types import FrictionLaw, InputError

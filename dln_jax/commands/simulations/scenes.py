@@ -10,9 +10,9 @@ import numpy as np
 
 from dln_jax.commands.simulate import Arguments
 from dln_jax.data import meshes
+from dln_jax.errors import require_memory, require_within
 from dln_jax.precision import data_type
 from dln_jax.runs.arguments import names_listed, numbers_of, pairs_of, refuse_given
-from dln_jax.sizes import require_memory, require_within
 from dln_jax.softbody.driven import Example, driven_step
 from dln_jax.softbody.examples import EXAMPLES
 from dln_jax.softbody.integrators import INTEGRATORS

@@ -23,9 +23,9 @@ from typing import Any, Literal, NamedTuple, get_args, get_type_hints
 from filelock import FileLock
 
 from dln_jax.files import as_type, is_file, read_json, write_json
+from dln_jax.options import CompilationCache
 from dln_jax.runs.arguments import arguments_for, pairs_of, parse
 from dln_jax.runs.folder import CONFIG, LOCK
-from dln_jax.runs.options import CompilationCache
 from dln_jax.runs.running import INTERRUPTED
 from dln_jax.types import InputError
 

@@ -41,6 +41,7 @@ from dln_jax.control.plants.scales import scales_of
 from dln_jax.control.plants.ways import require_recovery
 from dln_jax.control.tracking import without_friction
 from dln_jax.data import schema
+from dln_jax.errors import require_memory
 from dln_jax.figures.closed_loops import (
     MOST_SHOWN,
     cart_pole_drawing,
@@ -56,7 +57,6 @@ from dln_jax.runs.arguments import names_listed
 from dln_jax.runs.folder import command_folder
 from dln_jax.runs.progress import progress
 from dln_jax.runs.report import Report, finish, png, rows_of
-from dln_jax.sizes import require_memory
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import save
 

@@ -16,8 +16,8 @@ from dln_jax.control.plants.mujoco_plants import layout_of_file
 from dln_jax.control.plants.plant import Layout, layout
 from dln_jax.control.plants.postures import extremes
 from dln_jax.control.state_space import Field, field_of
+from dln_jax.data.joints import needs_from_json
 from dln_jax.data.robots import read_robot
-from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.mechanics import equations
 from dln_jax.mechanics.dynamics import Dynamics, PhaseRates
 from dln_jax.mechanics.trees.description import tree_to_json

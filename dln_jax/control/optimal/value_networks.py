@@ -18,9 +18,9 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.control.optimal.problem import ControlProblem, features
+from dln_jax.errors import require_network
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import Activation, softplus, tanh
-from dln_jax.sizes import require_network
 from dln_jax.types import InputError, require_positive
 
 

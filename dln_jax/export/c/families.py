@@ -34,7 +34,7 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
-from dln_jax.data.stated_needs import needs_from_json
+from dln_jax.data.joints import needs_from_json
 from dln_jax.mechanics import discrete, jacobians
 from dln_jax.mechanics.discrete import ITERATIONS, Actuation
 from dln_jax.mechanics.dynamics import Dynamics, Flow, PhaseRates, PlainFlow

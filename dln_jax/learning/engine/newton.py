@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from dln_jax.errors import require_memory
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import (
     Best,
@@ -22,7 +23,6 @@ from dln_jax.learning.engine.problem import (
 )
 from dln_jax.precision import quick_compilation
 from dln_jax.scale import first, replicate, shard, spread
-from dln_jax.sizes import require_memory
 from dln_jax.solvers import levenberg_marquardt
 from dln_jax.solvers.levenberg_marquardt import Arrays, LevenbergMarquardtState, Status
 from dln_jax.types import InputError

@@ -19,11 +19,10 @@ from jaxtyping import Float
 
 from dln_jax.data.arrays import spread
 from dln_jax.data.encoders.sampling import noise_of
-from dln_jax.data.log import Log
-from dln_jax.data.parts import Parts
+from dln_jax.data.joints import needs_from_json
+from dln_jax.data.log import Log, Parts
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import every
-from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.files import is_file, read_json, write_json
 from dln_jax.identification import residual
 from dln_jax.identification.identify import identify, parameters_of

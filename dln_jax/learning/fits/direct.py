@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.data.log import Log
-from dln_jax.data.parts import Parts
+from dln_jax.data.log import Log, Parts
 from dln_jax.files import read_json
 from dln_jax.learning import dynamics
 from dln_jax.learning.dynamics import without_offset

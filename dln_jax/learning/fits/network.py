@@ -7,10 +7,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from dln_jax.data.log import Log
-from dln_jax.data.parts import Parts
+from dln_jax.data.log import Log, Parts
 from dln_jax.data.splits import Split, drawn, merged
 from dln_jax.data.splits import select as trajectories
+from dln_jax.errors import require_network
 from dln_jax.learning import dynamics
 from dln_jax.learning.dynamics import MANY_JOINTS, suited_network, summed_with_friction, without_offset
 from dln_jax.learning.engine.checkpoint import CHECKPOINT, Context, no_progress
@@ -19,12 +19,11 @@ from dln_jax.learning.engine.optimisers import optimiser_named
 from dln_jax.learning.engine.problem import Training, losses
 from dln_jax.learning.fit import Fit
 from dln_jax.learning.fits.settings import OF_ADAM, Network
-from dln_jax.learning.latency import latency_of
 from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, objective_of
 from dln_jax.learning.select import say_selection
 from dln_jax.process import SOON
+from dln_jax.runs.report import latency_of
 from dln_jax.scale import device_lines, of_first_process
-from dln_jax.sizes import require_network
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build, describe_for

@@ -14,7 +14,6 @@ from dln_jax.options import InPython, Unstated
 
 if TYPE_CHECKING:
     import dln_jax.data.log
-    import dln_jax.data.parts
     import dln_jax.learning.engine.checkpoint
     import dln_jax.learning.fit
 
@@ -34,7 +33,7 @@ class Way:
     def fit(
         self,
         log: "dln_jax.data.log.Log",
-        parts: "dln_jax.data.parts.Parts",
+        parts: "dln_jax.data.log.Parts",
         context: "dln_jax.learning.engine.checkpoint.Context",
     ) -> "dln_jax.learning.fit.Fit":
         """Fits a model to the training motions of a log."""

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories
+from dln_jax.errors import require_memory
 from dln_jax.files import cache_folder
 from dln_jax.mechanics import closed_form, lagrangian
 from dln_jax.mechanics.closed_form import ClosedForm
@@ -20,7 +21,6 @@ from dln_jax.precision import in_float64
 from dln_jax.scenes.datasets.letters import LETTERS, letter_path, require_finite
 from dln_jax.scenes.pendulums import joint_angles, two_link_arm
 from dln_jax.scenes.scene import Scene, closed_form_forward_dynamics
-from dln_jax.sizes import require_memory
 from dln_jax.types import InputError, require_seed
 
 CHARACTERS_TEST = ("e", "q", "v")

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy.typing import ArrayLike
 
-from dln_jax.sizes import require_memory
+from dln_jax.errors import require_memory
 from dln_jax.softbody.mesh.mesh import Mesh, boundary, make_mesh
 from dln_jax.types import InputError, require_positive
 

@@ -12,7 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from dln_jax.sizes import LARGEST
+from dln_jax.errors import LARGEST
 from dln_jax.softbody.mesh.mesh import FLAT, WORDS, Mesh, NamedSet, make_mesh
 from dln_jax.softbody.mesh.simplices import regularity
 from dln_jax.types import InputError, require_positive

@@ -19,13 +19,13 @@ from dln_jax.export.low_latency import enable_low_latency
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
-from dln_jax.learning.latency import one_step
 from dln_jax.learning.linear import fit_linear
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import NaturalSystem, lagrangian
 from dln_jax.models.model import Model, cholesky_factor, make_delan
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import tanh
+from dln_jax.runs.report import one_step
 from dln_jax.scenes.pendulums import chain
 from dln_jax.types import Lagrangian
 from dln_jax.zoo.descriptions import build
