@@ -155,6 +155,7 @@ def interrupted(command: str, options: Any, folder: Path | None = None) -> str:
 
 def require_possible(options: Any) -> None:
     """Raises `InputError` for an option that is not finite or is implausibly large."""
+    counts = {}
     for name, value in dataclasses.asdict(options).items():
         option = f"--{name.replace('_', '-')}"
         if isinstance(value, float):
@@ -165,4 +166,5 @@ def require_possible(options: Any) -> None:
             if not 0 <= value <= LARGEST_SEED:
                 raise InputError(f"seed is {value}; expected whole numbers from 0 to {LARGEST_SEED}")
         elif isinstance(value, int):
-            require_within({option: value})
+            counts[option] = value
+    require_within(counts)

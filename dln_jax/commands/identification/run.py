@@ -50,6 +50,7 @@ from dln_jax.runs.folder import command_folder
 from dln_jax.runs.report import Report, finish, png
 from dln_jax.types import FrictionLaw, InputError
 from dln_jax.zoo.descriptions import Description
+from dln_jax.zoo.run import save
 
 SETTLED = (*SPLIT, "friction", "condition")
 """Checks of a log that the robot's file and this command make unnecessary."""
@@ -125,7 +126,7 @@ def run(options: Arguments) -> None:
         parameters = parameters_of(solution.theta, known)
         seconds = time.perf_counter() - began
         fit = Fit(model, parameters, description, needs=tree.needs)
-        fit.save(folder)
+        save(folder, description, parameters)
 
         train, test, *motions = at_reference(description, model, parameters, *logs)
         predict = predictor(model)

@@ -188,15 +188,18 @@ def _spikes(values: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
 
 
 def _saturated(data: Trajectories, key: str, word: str, remedy: str) -> list[Finding]:
-    shares = np.array([flat_share(channel, data.trajectory) for channel in getattr(data, key).T])
+    channels = getattr(data, key)
+    each = zip(channels.T, step_of(channels), strict=True)
+    shares = np.array([flat_share(channel, data.trajectory, step) for channel, step in each])
     observation = f"the {word} of {{}} is cut off flat in up to {shares.max():.1%} of the samples"
     return on_joints("warning", f"saturation-{key}", shares > SHARE, observation, remedy)
 
 
-def flat_share(channel: np.ndarray, trajectory: np.ndarray) -> float:
+def flat_share(channel: np.ndarray, trajectory: np.ndarray, step: float) -> float:
     """Fraction of samples in runs at the largest or smallest value that are entered or left abruptly.
 
     A smooth extreme is approached ever more slowly and a joint at rest does not move; a limit cuts a motion off.
+    `step` is the channel's step size.
     """
     size = np.ptp(channel)
     if size == 0:
@@ -206,7 +209,7 @@ def flat_share(channel: np.ndarray, trajectory: np.ndarray) -> float:
     moving = moves[same & (moves > 1e-9 * size)]
     typical = np.median(moving) if len(moving) else np.inf
     # A smooth extreme of at least RUN samples in steps is entered and left by fewer than three steps.
-    abrupt = max(ABRUPT * typical, 3 * float(step_of(channel[:, None])[0]))
+    abrupt = max(ABRUPT * typical, 3 * float(step))
     count = 0
     for extreme in (channel.max(), channel.min()):
         at = np.abs(channel - extreme) <= 1e-9 * size

@@ -11,6 +11,7 @@ from dln_jax.data.checks.channels import check_derivatives, flat_share
 from dln_jax.data.checks.priors import STRONGEST, WEAKEST, Explanation, covariances
 from dln_jax.data.checks.report import examine, quick, read, report
 from dln_jax.data.checks.torques import decisive
+from dln_jax.data.encoders.sampling import step_of
 from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.log import FILTERED, log_of
 from dln_jax.data.robots import Robot
@@ -382,4 +383,5 @@ def test_steps_of_a_smooth_extreme_are_not_cut_off():
         (4 * np.sin(12 * t + 0.03), 0.05, False),
         (np.clip(torque, -3.0, 3.0), 0.01, True),
     ):
-        assert (flat_share(np.round(values / step) * step, np.zeros(2000, int)) > 0.1) == cut
+        rounded = np.round(values / step) * step
+        assert (flat_share(rounded, np.zeros(2000, int), step_of(rounded[:, None])[0]) > 0.1) == cut
