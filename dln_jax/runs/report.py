@@ -142,7 +142,8 @@ def one_step(function: Callable, states: Sequence[tuple], *, calls: int = 5000) 
 
 def latency_of(run: Run, data: Trajectories, *, calls: int = 5000) -> Latency:
     """Latency of the inverse dynamics of a model, over up to 512 states of the data."""
-    arrays = (np.asarray(array[:512], run.dtype) for array in (data.q, data.qd, data.qdd))
+    dtype = run.dtype
+    arrays = (np.asarray(array[:512], dtype) for array in (data.q, data.qd, data.qdd))
     states = [tuple(map(jnp.asarray, state)) for state in zip(*arrays, strict=True)]  # rows of NumPy need no program
     return one_step(run.dynamics.inverse_dynamics, states, calls=calls)
 
