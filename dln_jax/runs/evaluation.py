@@ -28,11 +28,12 @@ from dln_jax.metrics.errors import (
     prediction_program,
     samples_of,
 )
+from dln_jax.metrics.latency import latency_of
 from dln_jax.metrics.motions import Motion, by_trajectory, metrics_of_motions, motion_program, records_of
 from dln_jax.models.model import Model
 from dln_jax.models.uncertainty import Uncertainty, deviation_of_rows, exceeds, scores_of_rows
 from dln_jax.precision import compiled
-from dln_jax.runs.report import Report, cost_metrics, latency_of, number, png, unit_of
+from dln_jax.runs.report import Report, cost_metrics, number, png, unit_of
 from dln_jax.runs.verdict import verdict_of
 from dln_jax.types import InputError
 

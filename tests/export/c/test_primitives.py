@@ -46,8 +46,6 @@ UNARY = {
     "integer_pow": lambda x: [lax.integer_pow(x, n) for n in (0, 2, 3, 7, -1, -3)],
     "clamp": lambda x: lax.clamp(x.dtype.type(-0.7), x, x.dtype.type(0.9)),
     "copysign_and_frexp": lambda x: (jnp.copysign(x, jnp.flip(x)), jnp.frexp(jax.device_put(x))),
-        ~lax.bitcast_convert_type(x, jnp.dtype(f"u{x.dtype.itemsize}")), x.dtype
-    ),
     "converted": lambda x: (jnp.where(jnp.abs(x) < 100, x, 0).astype(int), x.astype(bool)),
     "saturating_conversions": lambda x: [(1e17 * x).astype(kind) for kind in KINDS],
     "reduce_precision": lambda x: [
