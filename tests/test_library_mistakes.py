@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import dln_jax
+from dln_jax import errors
 from dln_jax.data import schema
 from dln_jax.errors import memory, require_memory, require_network
 from dln_jax.learning.engine import newton
@@ -168,7 +169,7 @@ AT_THE_LIMIT = {  # what is asked for, and the bytes that it is estimated to tak
 
 @pytest.mark.parametrize("asked, estimate", AT_THE_LIMIT.values(), ids=AT_THE_LIMIT)
 def test_what_does_not_fit_is_refused_before_it_is_allocated(asked, estimate, monkeypatch):
-    monkeypatch.setattr(sizes, "memory", lambda: estimate - 1.0)
+    monkeypatch.setattr(errors, "memory", lambda: estimate - 1.0)
     tracemalloc.start()
     try:
         with pytest.raises(InputError, match=r"would take about .* GiB of memory.*ask for less") as caught:
@@ -178,5 +179,5 @@ def test_what_does_not_fit_is_refused_before_it_is_allocated(asked, estimate, mo
         tracemalloc.stop()
     assert "\n" not in str(caught.value)
     # One byte more is enough: what is made is what was estimated for.
-    monkeypatch.setattr(sizes, "memory", lambda: float(estimate))
+    monkeypatch.setattr(errors, "memory", lambda: float(estimate))
     asked()

@@ -189,8 +189,8 @@ def _spikes(values: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
 
 def _saturated(data: Trajectories, key: str, word: str, remedy: str) -> list[Finding]:
     channels = getattr(data, key)
-    each = zip(channels.T, step_of(channels), strict=True)
-    shares = np.array([flat_share(channel, data.trajectory, step) for channel, step in each])
+    with_steps = zip(channels.T, step_of(channels), strict=True)
+    shares = np.array([flat_share(channel, data.trajectory, step) for channel, step in with_steps])
     observation = f"the {word} of {{}} is cut off flat in up to {shares.max():.1%} of the samples"
     return on_joints("warning", f"saturation-{key}", shares > SHARE, observation, remedy)
 
