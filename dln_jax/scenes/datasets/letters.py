@@ -156,7 +156,7 @@ def _position(
     return periodic + phase * displacements[stroke]
 
 
-def require_finite(**numbers: float) -> None:
+def require_finite(**numbers: int | float) -> None:
     """Raises `InputError` that names the first number that is not positive and finite."""
     for name, value in numbers.items():
         if not 0 < value < math.inf:

@@ -167,7 +167,7 @@ def _require_room(elements: int) -> None:
     require_memory(f"a mesh of {elements:,} elements", 4096.0 * elements)
 
 
-def _require_sizes(**sizes: float) -> None:
+def _require_sizes(**sizes: int | float) -> None:
     require_positive(**sizes)
     for name, value in sizes.items():
         if not math.isfinite(value):
