@@ -122,13 +122,13 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
     """Checks for still joints, constant torques, spikes, steps and flat tops; `rates` are qd of the filtered q."""
     still = np.ptp(data.q, axis=0) <= 1e-9 * max(1.0, np.abs(data.q).max())
     speed = np.full(len(still), np.inf) if rates is None else rates.std(axis=0)
-    cases: list[Case] = [
+    findings = findings_of(
         ("warning", "unexcited", still, "the position of {} is constant",
          "move it in some trajectories, or leave it out of q: its inertia and friction cannot be learned"),
         ("warning", "unexcited", (speed < WEAK * np.median(speed)) & ~still,
          f"the speed of {{}} is less than {WEAK:.0%} of that of other joints",
          "excite it more: the log hardly shows its dynamics"),
-    ]  # fmt: skip
+    )  # fmt: skip
     if "tau" not in data.estimated:
         # A joint without a motor has zero torque; a passive system has only such joints.
         driven = np.ones(len(still), bool)
@@ -138,7 +138,7 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
         fast = np.abs(data.qd) > FAST * np.sqrt(np.mean(data.qd**2, axis=0))
         zero = np.sum((data.tau == 0) & fast, axis=0) / np.maximum(fast.sum(axis=0), 1)
         hidden = driven & (zero > HIDDEN) & ~dead & ~still
-        cases += [
+        findings += findings_of(
             ("warning", "dead-torque", dead, "the torque of {} is zero in all samples, although the position changes",
              "log that torque; or state in needs, by actuation, that the joint has no motor"),
             ("warning", "hidden-torque", hidden,
@@ -146,7 +146,7 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
              "unless the motors were off, the drivers hide small torques: leave such joints out (--lock)"),
             ("warning", "constant-torque", (np.ptp(data.tau, axis=0) == 0) & (data.tau[0] != 0),
              "the torque of {} is constant", "check that the right channel was logged"),
-        ]  # fmt: skip
+        )  # fmt: skip
     for key, word, of_spikes, of_limits in (
         ("q", "position", "leave those samples out",
          "check whether it is at its stop or the log is clipped; leave those samples out"),
@@ -159,17 +159,16 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
         spikes, steps = _spikes(channels, data.trajectory).sum(axis=0), step_of(channels)
         pairs = zip(channels.T, steps, strict=True)
         flat = np.array([flat_share(channel, data.trajectory, step) for channel, step in pairs])
-        cases += [
+        findings += findings_of(
             ("warning", "spikes", spikes > 0, f"the {word} of {{}} has {spikes.sum()} spike(s)", of_spikes),
             ("warning", f"saturation-{key}", flat > SHARE,
              f"the {word} of {{}} is cut off flat in up to {flat.max():.1%} of the samples", of_limits),
-        ]  # fmt: skip
+        )  # fmt: skip
     steps = step_of(data.q)
-    cases.append(
+    return findings + findings_of(
         ("note", "quantisation", steps > COARSE, f"q of {{}} comes in steps of up to {steps.max():.2g}",
          "filter before rates are derived: --cutoff auto, or smooth()")
     )  # fmt: skip
-    return findings_of(*cases)
 
 
 def _spikes(values: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
@@ -258,7 +257,7 @@ def away_from_ends(part: Int[np.ndarray, " N"], farthest: int) -> Int[np.ndarray
 
 def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
     """Checks that qd is the rate of q, and qdd the rate of qd, if the file has them; `even` is smooth(data, trim=0)."""
-    cases: list[Case] = []
+    findings = []
     part, moves = even.data.trajectory, data.q.std(axis=0) > 0
     derived = ("qd", even.data.qd, "dq/dt"), ("qdd", even.data.qdd, "d²q/dt²")
     for (key, own, formula), (_, other, name) in zip(derived, derived[::-1], strict=True):
@@ -274,7 +273,7 @@ def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
         exchanged = ((left_other < 1 - ALIKE**2) & (left_other < EXCHANGED * left))[moves]
         if exchanged.size and exchanged.all():
             remedy = f"exchange qd and qdd, or {RATE_REMEDY}"
-            cases.append(("error", f"{key}-exchanged", True, f"{key} is {name}, not {formula}", remedy))
+            findings += findings_of(("error", f"{key}-exchanged", True, f"{key} is {name}, not {formula}", remedy))
             continue
         farthest = max(2, min(round(FARTHEST * even.rate), 40, len(measured) // 8))
         factor, delay, correlation, gained = _match(measured, own, part, farthest)
@@ -294,7 +293,7 @@ def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
         delayed = f"up to {abs(worst) / even.rate * 1e3:.3g} ms {'late' if worst > 0 else 'early'}"
         ratios = ", ".join(f"{number:.3g}" for number in factor[odd])
         of = f"{key} of {{}}"
-        cases += [
+        findings += findings_of(
             ("error", f"{key}-unit", degrees, f"{of} is 57.3 times {formula}",
              f"convert {key} from degrees to radians"),
             ("error", f"{key}-unit", radians, f"{of} is {formula} / 57.3", "convert q from degrees to radians"),
@@ -306,8 +305,8 @@ def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
             ("error", f"{key}-unlike", (np.abs(correlation) < UNLIKE) & moves, f"{of} does not follow {formula}",
              f"check the order of the columns, or {RATE_REMEDY}"),
             ("warning", f"{key}-delay", late, f"{of} is {delayed} relative to q", RATE_REMEDY),
-        ]  # fmt: skip
-    return findings_of(*cases)
+        )  # fmt: skip
+    return findings
 
 
 def _at_times_of(data: Trajectories, even: Smoothed, values: np.ndarray) -> np.ndarray:
