@@ -89,11 +89,12 @@ def main(options: Arguments) -> None:
     from dln_jax.learning.engine.optimisers import GaussNewton, check
     from dln_jax.learning.engine.problem import Progress, Training, losses
     from dln_jax.learning.functions import GAUSS_NEWTON, WIDTHS, Network, grow_width, published_adam, targets, train
+    from dln_jax.metrics.latency import one_step
     from dln_jax.nn.activations import activation
     from dln_jax.precision import require_float64
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
-    from dln_jax.runs.report import Report, cost_metrics, finish, number, one_step, png, unit_of
+    from dln_jax.runs.report import Report, cost_metrics, finish, number, png, unit_of
     from dln_jax.runs.scaled import mesh_of
     from dln_jax.scale import device_lines
     from dln_jax.types import require_seed

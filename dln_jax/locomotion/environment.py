@@ -11,12 +11,6 @@ from dln_jax.locomotion.task import FALLEN, LocomotionTask, advance, beginning, 
 from dln_jax.types import InputError
 
 
-def spaces(task: LocomotionTask) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    """Returns the spaces of observations and of actions."""
-    seen = gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
-    return seen, gymnasium.spaces.Box(-1.0, 1.0, (task.muscle_count,), np.float32)
-
-
 class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     """Environment of one creature, with the task's rewards.
 
@@ -27,7 +21,8 @@ class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def __init__(self, task: LocomotionTask):
         self.task = task
-        self.observation_space, self.action_space = spaces(task)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (task.muscle_count,), np.float32)
         self._place = beginning(task)
         self._begin = jax.jit(lambda key: beginning(task, key))
         self._advance = jax.jit(lambda place, action: advance(task, place, change_of(place.actuation, action)))

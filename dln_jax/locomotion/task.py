@@ -88,7 +88,7 @@ class LocomotionTask(NamedTuple):
     variation: Variation
     clock_period: float
     """P in steps; 0 for no clock."""
-    dt: float = TIME_STEP
+    dt: float
     """Time step in s."""
 
     @property

@@ -141,7 +141,8 @@ def model_of(
     def energies(parameters: Parameters) -> Any:
         def checked(function: Callable[..., Any], *state: Array) -> Any:
             for vector in state:
-                require_shape("a state of this model", vector.shape, (d,))
+                if vector.shape != (d,):
+                    require_shape("a state of this model", vector.shape, (d,))
             return function(parameters, *state)
 
         return record(**{name: partial(checked, function) for name, function in networks.apply.items()})

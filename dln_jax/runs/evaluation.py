@@ -28,11 +28,12 @@ from dln_jax.metrics.errors import (
     prediction_program,
     samples_of,
 )
+from dln_jax.metrics.latency import latency_of
 from dln_jax.metrics.motions import Motion, by_trajectory, metrics_of_motions, motion_program, records_of
 from dln_jax.models.model import Model
 from dln_jax.models.uncertainty import Uncertainty, deviation_of_rows, exceeds, scores_of_rows
 from dln_jax.precision import compiled
-from dln_jax.runs.report import Report, cost_metrics, latency_of, number, png, unit_of
+from dln_jax.runs.report import Report, cost_metrics, number, png, unit_of
 from dln_jax.runs.verdict import verdict_of
 from dln_jax.types import InputError
 
@@ -105,12 +106,13 @@ def evaluate(
         of_seeds = [predict(fit.of_seed(index), samples)["tau"] for index in range(seeds)]
         errors_of_seeds = [mean_square(np.asarray(tau, float)[: len(test.t)] - test.tau) for tau in of_seeds]
         spread = {f"torque_mse_{name}": float(function(errors_of_seeds)) for name, function in SUMMARIES.items()}
-    figures = figures_of(fit, parts, log, motions, predicted)
+    summed = fit.summed(parts)
+    figures = figures_of(fit, parts, log, motions, predicted, summed)
     of_bands, of_figures = bands_of(fit, test, predicted["tau"])
     figures |= of_figures
     metrics = {
         **errors(predicted, test),
-        "gravity_determined": int(not fit.summed(parts)),
+        "gravity_determined": int(not summed),
         **of_verdict,
         **spread,
         **of_bands,
@@ -132,7 +134,7 @@ def evaluate(
         verdict=verdict,
         figures=figures,
         chosen=choices_of(fit, parts, log),
-        lines=tuple(lines_on(fit, parts)),
+        lines=tuple(lines_on(fit, summed)),
         error=failure(fit),
     )
 
@@ -206,21 +208,23 @@ def _bands(uncertainty: Uncertainty, rows: Any, state: tuple[Any, ...]) -> tuple
 
 
 def figures_of(
-    fit: Fit, parts: Parts, log: Log, motions: list[Motion], predicted: dict[str, np.ndarray]
+    fit: Fit, parts: Parts, log: Log, motions: list[Motion], predicted: dict[str, np.ndarray], summed: list[int]
 ) -> dict[str, Callable[[Path], None]]:
-    """The applicable figures; `motions` are the model's rollouts of the test, possibly none."""
+    """The applicable figures; `motions` are the model's rollouts of the test, possibly none.
+
+    `summed` are the joints whose gravity and friction are known only in sum.
+    """
     test, training = parts.sets.test, fit.training
-    note = " (gravity in sum with friction)" if fit.summed(parts) else ""
-    figures = {"decomposition.png": png(force_decomposition, test, predicted, model=fit.name, note=note)}
+    note = " (gravity in sum with friction)" if summed else ""
+    name = fit.name
+    figures = {"decomposition.png": png(force_decomposition, test, predicted, model=name, note=note)}
     if training.history and fit.optimiser is not None:
         torque = fit.objective.selects_by == "torque"
         units = {} if torque else {"error": "loss (normalised)", "unit": "loss, in units of the data's spread"}
         best = int(np.max(training.best_step))
         figures["training.png"] = png(training_curve, training.history, best_step=best, **units)
     if log.tip is not None:
-        figures["tip_paths.png"] = png(
-            tip_paths, merged(parts.sets), log.tip, test=test, motions=motions, model=fit.name
-        )
+        figures["tip_paths.png"] = png(tip_paths, merged(parts.sets), log.tip, test=test, motions=motions, model=name)
     return figures
 
 
@@ -255,12 +259,12 @@ def choices_of(fit: Fit, parts: Parts, log: Log) -> dict[str, Any]:
     return chosen | {"seeds": fit.seeds}
 
 
-def lines_on(fit: Fit, parts: Parts) -> Iterator[str]:
+def lines_on(fit: Fit, summed: list[int]) -> Iterator[str]:
     """Lines on the seed that is kept, forces known only in sum, and a training that ended early."""
     if not isinstance(fit.seeds, int):
         by = "cross-validation" if fit.cross_validated else "validation"
         yield f"the run keeps seed {fit.seeds[fit.best]}, the best in {by}"
-    if summed := fit.summed(parts):
+    if summed:
         yield f"gravity and friction of joints {summed} are known only in sum; the potential takes any constant"
     stop = fit.training.stop
     if stop.reason == "no improvement":

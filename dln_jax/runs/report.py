@@ -1,27 +1,19 @@
-"""The end of a run: its files, printed table, verdict and exit status, its figures, and the time of single calls."""
+"""The end of a run: its files, printed table, verdict and exit status, and its figures."""
 
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
-import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Column, Table
 
-from dln_jax.data.schema import Trajectories
 from dln_jax.errors import FitRefused, InputError
 from dln_jax.files import write_figure, write_json
 from dln_jax.learning.engine.problem import Training
+from dln_jax.metrics.latency import Latency
 from dln_jax.metrics.verdict import Verdict
 from dln_jax.runs.folder import write_config
-from dln_jax.zoo.run import Run
-
-WARM_UP = 200
-"""Calls before those that are timed; the first compiles."""
 
 
 class Report(NamedTuple):
@@ -116,35 +108,6 @@ def number(metric: str, value: int | float) -> str:
 def rows_of(metrics: Mapping[str, float | int]) -> list[tuple[str, str, str]]:
     """Rows of the printed table for metrics whose names say what they are, with the unit of times."""
     return [(key.replace("_", " "), f"{value:.4g}", "s" if "seconds" in key else "") for key, value in metrics.items()]
-
-
-class Latency(NamedTuple):
-    """Percentiles of the wall-clock time of single calls until their results are ready, without compilation."""
-
-    p50_us: float
-    p99_us: float
-
-
-def one_step(function: Callable, states: Sequence[tuple], *, calls: int = 5000) -> Latency:
-    """Times calls of a compiled function, one state at a time, cycling through the states.
-
-    The function is jitted, or takes NumPy arrays, and is called as `function(*state)`. All states have one shape; they
-    differ, so that no result comes from a cache.
-    """
-    nanoseconds = np.empty(WARM_UP + calls)
-    for index in range(WARM_UP + calls):
-        state = states[index % len(states)]
-        start = time.perf_counter_ns()
-        jax.block_until_ready(function(*state))
-        nanoseconds[index] = time.perf_counter_ns() - start
-    return Latency(*np.percentile(nanoseconds[WARM_UP:] / 1e3, [50, 99]).tolist())
-
-
-def latency_of(run: Run, data: Trajectories, *, calls: int = 5000) -> Latency:
-    """Latency of the inverse dynamics of a model, over up to 512 states of the data."""
-    arrays = (np.asarray(array[:512], run.dtype) for array in (data.q, data.qd, data.qdd))
-    states = [tuple(map(jnp.asarray, state)) for state in zip(*arrays, strict=True)]  # rows of NumPy need no program
-    return one_step(run.dynamics.inverse_dynamics, states, calls=calls)
 
 
 def one_step_metrics(latency: Latency) -> dict[str, float]:

@@ -62,12 +62,13 @@ def verdict_of(
         pairs = judged.values()
         accelerations = [held_out(answers["qdd"][part], data.qdd, recording=recording) for part, data in pairs]
         verdicts += [judge(errors, names, quantity="acceleration") for errors in accelerations]
-    remedy = f"try another --degree, --model {'structured-hnn' if fit.properties.canonical else 'structured-delan'}, "
+    properties = fit.properties
+    remedy = f"try another --degree, --model {'structured-hnn' if properties.canonical else 'structured-delan'}, "
     remedy += "or more varied motions"
     if infinite := sum(not np.isfinite([motion.q, motion.qd]).all() for motion in motions):
         reason = f"{infinite} of {len(motions)} rollouts of test motions are not finite"
         verdicts.append(Verdict("doubtful", reason, remedy))
-    if fit.properties.energy and not fit.properties.definite:
+    if properties.energy and not properties.definite:
         definite = definiteness(fit.dynamics, whole.q, whole.qd)
         if (share := definite.share_not_definite) > 0:
             reason = (

@@ -6,7 +6,6 @@ from typing import Any
 import jax
 from jaxtyping import Array, Float
 
-from dln_jax.softbody.mesh.intersections import count_overlaps
 from dln_jax.softbody.scene import (
     Params,
     SoftScene,
@@ -56,6 +55,5 @@ def static_solve(
     contact = prepare_contacts(scene, params, x)
     solve = partial(solve, moving=contact_energies(scene), moving_data=contact)
     x, outcome = solve(energies, x, data, free=scene.free, scale=params.masses, at=at)
-    overlaps = None if scene.contacts else count_overlaps(scene.mesh)
-    info = verdict_on_positions(scene, *jax.lax.stop_gradient((params, x, outcome)), overlaps, contact)
+    info = verdict_on_positions(scene, *jax.lax.stop_gradient((params, x, outcome)), contact)
     return trusted(x, info.converged), info

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 
 from dln_jax.softbody.friction_iterations import friction_change, has_friction, iterated
 from dln_jax.softbody.integrators import BACKWARD_EULER, Integrator, averaged, averaged_data, averaged_moving
-from dln_jax.softbody.mesh.intersections import count_overlaps
 from dln_jax.softbody.scene import (
     Growth,
     Params,
@@ -104,7 +103,6 @@ def step_parts(
         terms = tuple(averaged(element, scene.mesh.dimension) for element in stored)
     energies = (ElementEnergy(_inertia, np.arange(len(free))[:, None], unrolled=True), *terms)
     at = pattern(energies, free.shape[0], free.shape[1], free)
-    overlaps = None if scene.contacts else count_overlaps(scene.mesh)
     touching = contact_energies(scene)
     touched = [contact.name for contact in scene.contacts for _ in contact.energies]
     moving = tuple(map(averaged_moving, touching)) if integrator.averaged else touching
@@ -236,7 +234,7 @@ def step_parts(
         energies_of_step = energy_balance(
             scene, params.masses, at_start, (state.x, x), (state.v, v), work, outcome, stored
         )
-        info = verdict_on_positions(scene, params, x, outcome, overlaps, of_stored)._replace(friction_change=friction)
+        info = verdict_on_positions(scene, params, x, outcome, of_stored)._replace(friction_change=friction)
         return with_energies(info, energies_of_step, state.growth)
 
     return StepParts(init, balance, forces, conclude)

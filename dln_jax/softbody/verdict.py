@@ -12,7 +12,7 @@ Therefore the state also carries the energy created since its minimum, max(creat
 the same share of the largest energy at hand so far.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -52,9 +52,6 @@ class Info(NamedTuple):
     """Whether step or motion created more than `LARGEST_GROWTH` of the energy at hand. `None` for a static solve."""
     least_J: Float[Array, ""] | None = None
     """Smallest volume ratio J of elements that resist deformation, if any; at quadrature points if quadratic."""
-    overlaps: Int[Array, ""] | None = None
-    """Number of pairs of overlapping mesh components, which pass through each other without contact. `None` for a mesh
-    of one component and for a scene with contacts. Does not affect `converged`."""
     substeps: Int[Array, ""] | None = None
     """Number of parts that the step was divided into, 1 for a whole step; `None` without `halvings`."""
     least_distance: Float[Array, ""] | None = None
@@ -148,20 +145,17 @@ def verdict_on_positions(
     params: Params,
     x: Array,
     outcome: SolverInfo,
-    overlaps: Callable[[Array], Array] | None,
     contact: Sequence[Any],
 ) -> Info:
     """Combines the solver's verdict with that on the positions: no element may be inverted."""
     least = least_J(scene, params, x)
     converged = outcome.converged if least is None else outcome.converged & (least > 0)
-    pairs = None if overlaps is None else overlaps(x)
     return Info(
         outcome.residual,
         outcome.iterations,
         converged,
         outcome.definite,
         least_J=least,
-        overlaps=pairs,
         least_distance=least_distance(scene, x, outcome.lists[1], contact),
         overflow=outcome.overflow,
     )

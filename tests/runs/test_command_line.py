@@ -59,7 +59,7 @@ def test_what_cannot_be_parsed_is_one_line(monkeypatch, capsys):
         "--kind other": "--kind is 'other'; choose from this, that",
         "--steps many": "--steps must be a whole number; got 'many'",
         "--steps": "--steps lacks a value",
-        "--stepz 3": "unrecognised option: --stepz",
+        "--stepz 3": "unrecognised option: --stepz; did you mean --steps?",
         "--precision None": "--precision is 'None'; choose from f32, f64",
         "stray": "unrecognised option: stray",
     }.items():

@@ -52,21 +52,14 @@ def test_help_is_short_and_every_option_has_a_text(name, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "80")
     module = importlib.import_module(f"dln_jax.commands.{name}")
     texts = []
-    for line in ("--help", "-h", "--help-all"):
-        with pytest.raises(SystemExit) as ended:
+    for line in ("-h", "--help-all"):
+        with pytest.raises(SystemExit, match="0"):
             run(module.main, module.Arguments, prog=name, line=[line])
-        assert ended.value.code == 0
-        texts.append(capsys.readouterr().out)
-    short, same, whole = ([line.rstrip() for line in text.splitlines()] for text in texts)
-    assert short == same and len(short) <= 60 and max(map(len, short + whole)) <= 80
+        texts.append(capsys.readouterr().out.splitlines())
+    short, whole = texts
+    assert len(short) <= 60 and max(map(len, short + whole)) <= 80
     assert sum(line.startswith("  --") for line in short) <= 22
     assert all(option.text.strip() for option in options_of(arguments_for(module.Arguments, {})))
-
-
-def test_a_misspelt_option_is_corrected(capsys):
-    with pytest.raises(SystemExit):
-        run(train_delan.main, train_delan.Arguments, prog="train_delan", line=["--widht", "8"])
-    assert "did you mean --width?" in capsys.readouterr().err
 
 
 def shown(options, name):

@@ -12,16 +12,7 @@ from filelock import FileLock
 from dln_jax import InputError
 from dln_jax.files import write_json
 from dln_jax.runs.folder import CONFIG, LOCK, run_folder
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def names(folder="."):
-    return sorted(path.name for path in Path(folder).iterdir())
+from tests.test_files import here, names  # noqa: F401  a fixture
 
 
 def test_runs_that_start_together_get_folders_of_their_own():

@@ -14,10 +14,11 @@ from dln_jax.data.schema import column
 from dln_jax.figures.phase_space import Field, motion_figure, write_motion_gif
 from dln_jax.figures.style import TRUTH
 from dln_jax.figures.training import training_curve
+from dln_jax.metrics.latency import one_step
 from dln_jax.metrics.phase_space import Motions, energies, field_errors, field_rates, motion_errors, predict
 from dln_jax.metrics.predictions import on_grid, padded, predict_measured, prediction_metrics
 from dln_jax.metrics.verdict import judge_motions, quarter_period
-from dln_jax.runs.report import Report, one_step, one_step_metrics, png, unit_of
+from dln_jax.runs.report import Report, one_step_metrics, png, unit_of
 from dln_jax.zoo.run import Run
 
 SUBSTEPS = 4

@@ -21,6 +21,7 @@ from dln_jax.rollout import rollout
 from dln_jax.runs.progress import progress
 from dln_jax.runs.report import png
 from dln_jax.softbody.driven import Example, drive
+from dln_jax.softbody.mesh.intersections import count_overlaps
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.simplices import volume_ratios
 from dln_jax.softbody.scene import Params, State
@@ -49,6 +50,8 @@ class SimulatedMotion(NamedTuple):
     info: Info
     compile_seconds: float
     steps_per_second: float
+    overlaps: np.ndarray | None = None
+    """Pairs of components that overlap after each step [T]; `None` for one component, and with contact."""
 
     @property
     def finite(self) -> int:
@@ -89,7 +92,9 @@ def run_motion(prepared: PreparedScene, precision: Any) -> SimulatedMotion:
             show(min(done, steps), f"t = {min(done, steps) * dt:.2f} s")
     x, v, info = jax.tree.map(lambda *chunks: np.concatenate(chunks)[:steps], *seen)
     x, v = (np.concatenate([np.asarray(first)[None], rest]) for first, rest in ((start.x, x), (start.v, v)))
-    return SimulatedMotion(dt * np.arange(steps + 1), x, v, info, compiled, done / spent)
+    count = None if example.scene.contacts else count_overlaps(example.scene.mesh)
+    overlaps = None if count is None else np.asarray(jax.jit(lambda x: jax.lax.map(count, x))(x[1:]))
+    return SimulatedMotion(dt * np.arange(steps + 1), x, v, info, compiled, done / spent, overlaps)
 
 
 def results(scene: str, mesh: Mesh, motion: SimulatedMotion) -> list[Row]:
@@ -107,8 +112,8 @@ def results(scene: str, mesh: Mesh, motion: SimulatedMotion) -> list[Row]:
         "smallest_volume_ratio": (np.min(ratios), "1"),
         "energy_created_J": (np.sum(np.asarray(info.energy_growth)), "J"),
     }
-    if info.overlaps is not None:
-        rows["overlapping_components_max"] = info.overlaps.max(), "1"
+    if motion.overlaps is not None:
+        rows["overlapping_components_max"] = motion.overlaps.max(), "1"
     if info.least_distance is not None:
         rows["least_distance_of_surfaces"] = info.least_distance.min(), "m"
     bounds = {"steps_not_converged": 0.0}
@@ -141,10 +146,10 @@ def warnings(motion: SimulatedMotion) -> list[str]:
                 f"warning: {missed.sum()} of {steps} steps {what}, the first at t = {first:.4g} s: "
                 f"do not trust the motion from there on; {remedy}"
             )
-    if info.overlaps is not None and (meeting := info.overlaps > 0).any():
+    if motion.overlaps is not None and (meeting := motion.overlaps > 0).any():
         first = motion.t[np.argmax(meeting) + 1]
         lines.append(
-            f"warning: components overlap in {meeting.sum()} of {steps} steps (up to {info.overlaps.max()} pairs), "
+            f"warning: components overlap in {meeting.sum()} of {steps} steps (up to {motion.overlaps.max()} pairs), "
             f"first at t = {first:.4g} s: there is no contact between bodies, and they pass through each other"
         )
     if motion.finite < len(motion.t):

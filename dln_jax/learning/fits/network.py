@@ -21,8 +21,8 @@ from dln_jax.learning.fit import Fit
 from dln_jax.learning.fits.settings import OF_ADAM, Network
 from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, objective_of
 from dln_jax.learning.select import say_selection
+from dln_jax.metrics.latency import latency_of
 from dln_jax.process import SOON
-from dln_jax.runs.report import latency_of
 from dln_jax.scale import device_lines, of_first_process
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.catalogue import CATALOGUE

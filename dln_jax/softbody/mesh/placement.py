@@ -1,5 +1,7 @@
 """Several bodies in one mesh, and bodies moved to their places before the simulation."""
 
+import itertools
+
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -23,7 +25,7 @@ def join(*meshes: Mesh, **bodies: Mesh) -> Mesh:
         meshes += (mesh._replace(sets={**mesh.sets, name: whole}),)
     if len({(mesh.dimension, mesh.midsides is None) for mesh in meshes}) != 1:
         raise InputError("the meshes differ in dimension or order of their elements, or there is none; join alike ones")
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)]).astype(np.int32)
+    starts = [0, *itertools.accumulate(len(mesh.vertices) for mesh in meshes)]
     sets: dict[str, NamedSet] = {}
     elements = 0
     for mesh, start in zip(meshes, starts, strict=False):
@@ -38,9 +40,8 @@ def join(*meshes: Mesh, **bodies: Mesh) -> Mesh:
     return Mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
         nodes[:, :corners],
-        sum(mesh.turned for mesh in meshes),
-        sets,
-        None if meshes[0].midsides is None else nodes[:, corners:],
+        sets=sets,
+        midsides=None if meshes[0].midsides is None else nodes[:, corners:],
     )
 
 

@@ -17,8 +17,8 @@ from dln_jax.learning.objectives import objective_of
 from dln_jax.mechanics.equations import Driven, dynamics
 from dln_jax.mechanics.hamiltonian import legendre
 from dln_jax.metrics.errors import errors, mean_square
+from dln_jax.metrics.latency import one_step
 from dln_jax.models.model import Model
-from dln_jax.runs.report import one_step
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.types import Hamiltonian

@@ -22,10 +22,10 @@ from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.linear import fit_linear
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import NaturalSystem, lagrangian
+from dln_jax.metrics.latency import one_step
 from dln_jax.models.model import Model, cholesky_factor, make_delan
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import tanh
-from dln_jax.runs.report import one_step
 from dln_jax.scenes.pendulums import chain
 from dln_jax.types import Lagrangian
 from dln_jax.zoo.descriptions import build

@@ -50,14 +50,18 @@ def in_c(functions, states, folder, *, precision="f64", flags=("-O1",), **option
     return results
 
 
+def in_order(tree):
+    """A result with dictionaries as tuples of their values: JAX would sort the keys, C has them as written."""
+    return tuple(map(in_order, tree.values())) if isinstance(tree, dict) else tree
+
+
 def in_jax(functions, states, *, precision="f64"):
     """The same results from JAX: the functions are compiled together and mapped over the states."""
     stacked = {
         name: at_precision(jax.tree.map(lambda *leaves: np.stack(leaves), *states[name]), precision)
         for name in functions
     }
+    ordered = {name: lambda *state, f=function: in_order(f(*state)) for name, (function, _) in functions.items()}
     with jax.enable_x64(precision == "f64"):  # as they are exported
-        every = jax.jit(lambda states: {name: jax.vmap(functions[name][0])(*states[name]) for name in functions})(
-            stacked
-        )
+        every = jax.jit(lambda states: {name: jax.vmap(ordered[name])(*states[name]) for name in functions})(stacked)
     return {name: [np.asarray(leaf) for leaf in jax.tree.leaves(tree)] for name, tree in every.items()}

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
-from comparison import STRICT, needs_compiler
+from comparison import STRICT, in_order, needs_compiler
 
 from dln_jax.export.c import casadi as external_c
 from dln_jax.export.c.body import Source
@@ -59,7 +59,7 @@ def of_a_vector(name):
 
     def flat(x):
         arguments = [part.reshape(shape[::-1]).T for part, shape in zip(jnp.split(x, cuts), shapes, strict=True)]
-        return jnp.concatenate([jnp.ravel(result.T) for result in jax.tree.leaves(function(*arguments))])
+        return jnp.concatenate([jnp.ravel(result.T) for result in jax.tree.leaves(in_order(function(*arguments)))])
 
     return flat, [(*shape, 1, 1)[:2] for shape in shapes]
 

@@ -123,33 +123,3 @@ def test_an_error_is_nan(tmp_path):
     np.testing.assert_array_equal(numbers, [[1.0, 5.0], [np.nan, np.nan]])
     np.testing.assert_array_equal(whole, [[0, 1], [2**63 - 1, 2**63 - 1]])
     assert np.isnan(got["unsolved"][0]).all()
-
-
-MJCF = """
-<mujoco>
-  <option timestep="0.01" iterations="4"/>
-  <default><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" contype="0" conaffinity="0"/></default>
-  <worldbody>
-    <body><joint axis="0 1 0" damping=".1"/><geom/>
-      <body pos="0 0 -.3"><joint axis="0 1 0" damping=".1"/><geom/>
-        <body pos="0 0 -.3"><joint axis="1 0 0" damping=".1"/><geom/></body></body></body>
-  </worldbody>
-</mujoco>
-"""
-
-
-@pytest.mark.slow
-def test_a_step_of_mjx(tmp_path):
-    mjx = pytest.importorskip("mujoco.mjx")
-    model = mjx.put_model(mjx.mujoco.MjModel.from_xml_string(MJCF))
-    start = mjx.make_data(model)
-
-    def step(q, qd, tau):
-        after = mjx.step(model, start.replace(qpos=q, qvel=qd, qfrc_applied=tau))
-        return after.qpos, after.qvel
-
-    states = {"step": [tuple(row) for row in RANDOM.uniform(-1, 1, size=(5, 3, 3))]}
-    functions = {"step": (step, states["step"][0])}
-    ours, theirs = in_c(functions, states, tmp_path)["step"], in_jax(functions, states)["step"]
-    for one, other in zip(ours, theirs, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-13)

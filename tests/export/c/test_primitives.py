@@ -46,9 +46,6 @@ UNARY = {
     "integer_pow": lambda x: [lax.integer_pow(x, n) for n in (0, 2, 3, 7, -1, -3)],
     "clamp": lambda x: lax.clamp(x.dtype.type(-0.7), x, x.dtype.type(0.9)),
     "copysign_and_frexp": lambda x: (jnp.copysign(x, jnp.flip(x)), jnp.frexp(jax.device_put(x))),
-    "bits": lambda x: lax.bitcast_convert_type(
-        ~lax.bitcast_convert_type(x, jnp.dtype(f"u{x.dtype.itemsize}")), x.dtype
-    ),
     "converted": lambda x: (jnp.where(jnp.abs(x) < 100, x, 0).astype(int), x.astype(bool)),
     "saturating_conversions": lambda x: [(1e17 * x).astype(kind) for kind in KINDS],
     "reduce_precision": lambda x: [
@@ -301,11 +298,10 @@ FACTORED = {
     "qr_of_tall": lambda a, b: (jnp.linalg.qr(jnp.vstack([a, b.T])), jnp.linalg.qr(b, "complete")),
     "qr_of_wide": lambda a, b: (jnp.linalg.qr(b.T), jnp.linalg.qr(jnp.hstack([a, b]), mode="complete")),
     "reflectors": lambda a, b: lax.linalg.householder_product(a, jnp.tanh(a[0, :1])),
-    "times_reflectors": lambda a, b: [
-        lax.linalg.ormqr(a, jnp.tanh(a[0]), c, left=left, transpose=transpose)
-        for c, left in ((b, True), (b.T, False))
-        for transpose in (True, False)
-    ],
+    "times_reflectors": lambda a, b: (
+        lax.linalg.ormqr(a, jnp.tanh(a[0]), b, transpose=True),
+        lax.linalg.ormqr(a, jnp.tanh(a[0]), b.T, left=False),
+    ),
     "eigh": lambda a, b: (
         jax.vmap(lambda x: spectral(x, jnp.tanh))(jnp.stack([a + a.T, definite(a)])),
         jnp.linalg.eigvalsh(jnp.outer(b[:, 0], b[:, 0])),
