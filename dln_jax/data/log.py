@@ -16,14 +16,11 @@ from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import (
     BLOCKS,
+    EVERY_SIXTH,
     LEAST_TRAJECTORIES,
     Split,
-    by_motion,
     in_blocks,
     is_cut,
-    label_indices,
-    require_no_copies,
-    select,
     split,
     stated_test,
     with_joints,
@@ -312,15 +309,8 @@ def split_log(log: Log, test: str | None = None, *, seed: int = 0, validation: b
     present = np.unique(data.trajectory)
     blocks = len(present) != recordings
     motion = None if blocks else motion_numbers(data.q, data.trajectory)  # blocks of one motion may look alike
-    if validation:
-        sets = split(data, test=labels, seed=seed, motion=motion)
-    else:
-        held = by_motion(present, motion, HELD_OUT, least=2) if labels is None else label_indices(data, labels)
-        rest = np.setdiff1d(present, held)
-        if not len(rest) or not len(np.intersect1d(held, present)):
-            raise InputError("--test leaves no trajectory to fit, or none to judge by; name fewer, or others")
-        sets = Split(select(data, rest), select(data, []), select(data, held))
-        require_no_copies(sets.train, sets.test)
+    share, chosen = (0.1, EVERY_SIXTH) if validation else (0.0, HELD_OUT)
+    sets = split(data, test=labels, validation_share=share, seed=seed, motion=motion, chosen=chosen)
     remark = remark_on_repeats([sets.train, sets.validation], sets.test, motion)
     remarks = [remark] if remark else []
     if blocks and validation:

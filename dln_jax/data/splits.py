@@ -22,8 +22,8 @@ BLOCKS = 10
 """Number of time blocks per trajectory if there are too few trajectories."""
 GAP = 1.5
 """A step longer than this multiple of its trajectory's median step is a gap."""
-
-LAST = re.compile(r"last:\s*([\d.]+)\s*%")
+EVERY_SIXTH = slice(5, None, 6)
+LAST = re.compile(r"last:\s*(\d+\.?\d*|\.\d+)\s*%")
 ALL_IN_BLOCKS = "blocks"
 
 
@@ -129,23 +129,28 @@ def drawn(data: Trajectories, most: int, seed: int) -> Trajectories:
     return select_samples(data, rows)
 
 
-def in_blocks(data: Trajectories, blocks: int) -> Trajectories:
+def in_blocks(data: Trajectories, blocks: int, *, last: float = 0.0) -> Trajectories:
     """Cuts every trajectory into blocks of time that become trajectories of their own: "LABEL[0]" and so on.
 
-    Estimated rates stay unchanged. Neighbouring blocks are nearly identical at their common end.
+    With `last`, its last share becomes "LABEL[last]", and a single block before it "LABEL[first]". Estimated rates stay
+    unchanged. Neighbouring blocks are nearly identical at their common end.
 
     Raises:
-        InputError: a trajectory has fewer samples than blocks.
+        InputError: a trajectory has too few samples.
     """
     require_positive(blocks=blocks)
     numbers, labels = np.empty_like(data.trajectory), []
+    names = [*range(blocks), "last"] if blocks > 1 or not last else ["first", "last"]
     for index in np.unique(data.trajectory):
-        samples = np.flatnonzero(data.trajectory == index)
-        if len(samples) < blocks:
-            raise InputError(f"trajectory '{data.label[index]}' has {len(samples)} samples; expected at least {blocks}")
-        for block, part in enumerate(np.array_split(samples, blocks)):
+        samples, label = np.flatnonzero(data.trajectory == index), data.label[index]
+        first, late = np.split(samples, [len(samples) - round(last * len(samples))])
+        parts = [*np.array_split(first, blocks), late][: blocks + (last > 0)]
+        if not all(map(len, parts)):
+            end = f" and its last {last:.0%}" if last else ""
+            raise InputError(f"trajectory '{label}' has {len(samples)} samples, too few for {blocks} block(s){end}")
+        for name, part in zip(names, parts, strict=False):
             numbers[part] = len(labels)
-            labels.append(f"{data.label[index]}[{block}]")
+            labels.append(f"{label}[{name}]")
     return data._replace(trajectory=numbers, label=np.array(labels))
 
 
@@ -170,40 +175,45 @@ def split(
     validation_share: float = 0.1,
     seed: int = 0,
     motion: Int[np.ndarray, " T"] | None = None,
+    chosen: slice = EVERY_SIXTH,
 ) -> Split:
     """Splits trajectories into test, validation and training sets.
 
-    Without test labels every sixth trajectory is a test. The validation trajectories (at least one) are drawn by the
-    seed from the rest, so model selection never sees the test.
+    The validation trajectories (at least one) are drawn by the seed from those that are not for the test, so model
+    selection never sees the test.
 
     Args:
         data: trajectories.
-        test: labels of the test trajectories.
-        validation_share: share of the other trajectories that is for validation.
+        test: labels of the test trajectories (default: those of the chosen motions).
+        validation_share: share of the other trajectories that is for validation; zero for none.
         seed: seed of the draw.
         motion: number of the motion that each trajectory shows, as from `repeated_motions.motion_numbers`:
             trajectories of one motion stay together, if there are enough motions. By default every trajectory shows
             its own.
+        chosen: motions that are the test without labels.
 
     Raises:
-        InputError: a label is unknown or has no samples, fewer than two trajectories remain for training and
-            validation, a test trajectory is a copy of another one, or the seed is out of range.
+        InputError: a label is unknown or has no samples, too few trajectories remain for training and validation, a
+            test trajectory is a copy of another one, or the seed is out of range.
     """
     require_seed(seed)
     present = np.unique(data.trajectory)
-    test_indices = by_motion(present, motion, slice(5, None, 6)) if test is None else label_indices(data, test)
-    empty = np.setdiff1d(test_indices, present)
+    uses, least = (" and validation", LEAST_TRAJECTORIES) if validation_share else ("", 2)
+    held = by_motion(present, motion, chosen, least=least) if test is None else label_indices(data, test)
+    empty = np.setdiff1d(held, present)
     if len(empty):
         raise InputError(f"trajectory '{data.label[empty[0]]}' has no samples to test by; choose other test labels")
-    rest = np.setdiff1d(present, test_indices)
-    if len(rest) < 2 or len(test_indices) == 0:
+    rest = np.setdiff1d(present, held)
+    if len(rest) < least - 1 or not len(held):
         raise InputError(
-            f"{len(present)} trajectories, {len(test_indices)} of them for the test, leave {len(rest)} for training "
-            "and validation; at least 3 in all are needed: record more, or cut long ones and index the parts"
+            f"{len(present)} trajectories, {len(held)} of them for the test, leave {len(rest)} for training{uses}; "
+            f"at least {least} in all are needed: record more, test by fewer, or cut long ones and index the parts"
         )
-    require_no_copies(select(data, rest), select(data, test_indices))
-    train, validation = hold_out(select(data, rest), validation_share, seed, motion)
-    return Split(train, validation, test=select(data, test_indices))
+    train, validation = select(data, rest), select(data, [])
+    require_no_copies(train, select(data, held))
+    if validation_share:
+        train, validation = hold_out(train, validation_share, seed, motion)
+    return Split(train, validation, test=select(data, held))
 
 
 def by_motion(
@@ -211,7 +221,7 @@ def by_motion(
     motion: Int[np.ndarray, " T"] | None,
     chosen: slice | Int[np.ndarray, " c"],
     *,
-    least: int = LEAST_TRAJECTORIES,
+    least: int,
 ) -> Int[np.ndarray, " h"]:
     """Returns the trajectories of the chosen motions, or of the last one if the choice is empty.
 
@@ -306,26 +316,13 @@ def stated_test(data: Trajectories, text: str | None) -> tuple[Trajectories, lis
     Raises:
         InputError: a share that is not a percentage between 1 and 90, or a trajectory that is too short for it.
     """
-    if not is_cut(text) or text is None:
+    if text is None or not is_cut(text):
         return data, None if text is None else [label.strip() for label in text.split(",")]
     if text == ALL_IN_BLOCKS:
         return in_blocks(data, BLOCKS), None
     stated = LAST.fullmatch(text)
-    share = float(stated[1]) if stated and stated[1].count(".") < 2 and stated[1] != "." else 0.0
-    if not 1 <= share <= 90:
+    if stated is None or not 1 <= float(stated[1]) <= 90:
         raise InputError(f"--test is {text!r:.40}; expected a percentage of 1 to 90, such as last:30%")
-    present = np.unique(data.trajectory)
-    numbers, labels, held = np.empty_like(data.trajectory), [], []
-    for index in present:
-        samples = np.flatnonzero(data.trajectory == index)
-        first, last = np.split(samples, [len(samples) - round(share / 100 * len(samples))])
-        parts = np.array_split(first, BLOCKS) if len(present) == 1 else [first]
-        if not len(last) or min(map(len, parts)) < 1:
-            raise InputError(f"trajectory '{data.label[index]}' has {len(samples)} samples, too few for --test {text}")
-        for place, part in enumerate(parts):
-            numbers[part] = len(labels)
-            labels.append(f"{data.label[index]}[{place if len(parts) > 1 else 'first'}]")
-        numbers[last] = len(labels)
-        held.append(f"{data.label[index]}[last]")
-        labels.append(held[-1])
-    return data._replace(trajectory=numbers, label=np.array(labels)), held
+    labels = data.label[np.unique(data.trajectory)]
+    cut = in_blocks(data, BLOCKS if len(labels) == 1 else 1, last=float(stated[1]) / 100)
+    return cut, [f"{label}[last]" for label in labels]

@@ -107,5 +107,5 @@ def test_trajectories_are_held_out_whole_and_one_in_blocks_of_time():
     assert parts.blocks and len(parts.sets.train.t) == 48
     test = parts.sets.test
     assert [test.label[k] for k in np.unique(test.trajectory)] == ["0[2]", "0[7]"]
-    with one_line("leaves no trajectory to fit"):
+    with one_line("leave 0 for training; at least 2 in all"):
         split_log(log_of(one, "one"), "0", validation=False)

@@ -46,7 +46,7 @@ def test_statements_about_joints_are_checked():
         ),
         (lambda: with_joints(NAMED, ("elbow", "slide", "wrist")), "have 2 joints, the robot 3"),
         (lambda: with_joints(NAMED, ("elbow", "wrist")), "'wrist' is not among"),
-        (lambda: in_blocks(NAMED, 7), "has 6 samples; expected at least 7"),
+        (lambda: in_blocks(NAMED, 7), "has 6 samples, too few for 7"),
     ):
         with one_line(words):
             call()

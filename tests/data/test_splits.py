@@ -123,7 +123,7 @@ def test_stated_tests_are_labels_or_shares_that_leave_something():
     assert stated_test(log(20), "a, b")[1] == ["a", "b"] and stated_test(log(20), None)[1] is None
     for text, words in (
         *((f"last:{share}", "expected a percentage of 1 to 90") for share in ("0%", "95%", "30", "x%", ".%")),
-        ("last:2%", "'0' has 20 samples, too few for --test last:2%"),
+        ("last:2%", "'0' has 20 samples, too few for 10 block.s. and its last 2%"),
     ):
         with one_line(words):
             stated_test(log(20), text)

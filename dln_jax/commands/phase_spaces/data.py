@@ -20,16 +20,7 @@ from dln_jax.data.encoders.smoothing import FEWEST, smooth_locally
 from dln_jax.data.log import ASSUMED, NOISY, read_log
 from dln_jax.data.repeated_motions import motion_numbers
 from dln_jax.data.schema import Trajectories, column, time_derivative
-from dln_jax.data.splits import (
-    by_motion,
-    label_indices,
-    require_no_copies,
-    segments,
-    select,
-    select_samples,
-    stated_test,
-    with_joints,
-)
+from dln_jax.data.splits import segments, select_samples, split, stated_test, with_joints
 from dln_jax.learning.shooting import MeasuredWindows, Noise, Weights
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.metrics.predictions import cut_recordings, grid_places
@@ -284,17 +275,8 @@ def split_test(
             raise InputError(f"{file} has {len(data.t)} samples; expected some hundred, a fifth of them for the test")
         return select_samples(data, slice(0, count)), select_samples(data, slice(count, None)), ()
     data, labels = stated_test(data, test)
-    present = np.unique(data.trajectory)
-    if labels is None:
-        motion = motion_numbers(data.q, data.trajectory) if test is None else None
-        chosen = by_motion(present, motion, slice(5, None, 6), least=2)
-    else:
-        chosen = label_indices(data, labels)
-    rest = np.setdiff1d(present, chosen)
-    if not len(rest):
-        raise InputError(f"all trajectories of {file} are for the test; leave some to learn from")
-    fitted, held = select(data, rest), select(data, chosen)
-    require_no_copies(fitted, held)
+    motion = motion_numbers(data.q, data.trajectory) if test is None else None
+    fitted, _, held = split(data, test=labels, validation_share=0.0, motion=motion)
     return fitted, held, ()
 
 

@@ -73,99 +73,101 @@ class Finding(NamedTuple):
         return f"{self.severity}: {self.observation}; {self.remedy}"
 
 
-def on_joints(
-    severity: Severity, check: str, concerned: Bool[np.ndarray, " d"], observation: str, remedy: str
-) -> list[Finding]:
-    """A finding about the joints in a mask; empty without such joints.
+Case = tuple[Severity, str, bool | np.bool_ | Bool[np.ndarray, " d"], str, str]
+"""Severity, check, whether it holds (for the whole log, or a mask of the joints concerned), observation and remedy."""
 
-    "joint 3" or "joints 1, 2 and 4", counted from 1 as in figures, replaces {} in the observation.
+
+def findings_of(*cases: Case) -> list[Finding]:
+    """Findings of the cases that hold.
+
+    "joint 3" or "joints 1, 2 and 4", counted from 1 as in figures, replaces {} in an observation on joints.
     """
-    joints = tuple(map(int, np.flatnonzero(concerned)))
-    if not joints:
-        return []
-    *others, last = (str(joint + 1) for joint in joints)
-    names = f"joints {', '.join(others)} and {last}" if others else f"joint {last}"
-    return [Finding(severity, check, observation.replace("{}", names, 1), remedy, joints)]
+    findings = []
+    for severity, check, concerned, observation, remedy in cases:
+        joints = tuple(map(int, np.flatnonzero(concerned))) if np.ndim(concerned) else ()
+        if joints:
+            *others, last = (str(joint + 1) for joint in joints)
+            names = f"joints {', '.join(others)} and {last}" if others else f"joint {last}"
+            observation = observation.replace("{}", names, 1)
+        if np.any(concerned):
+            findings.append(Finding(severity, check, observation, remedy, joints))
+    return findings
 
 
 def check_times(data: Trajectories) -> list[Finding]:
     """Checks rate, jitter, gaps and the number of trajectories for a split."""
-    findings = []
     counts = np.unique(data.trajectory, return_counts=True)[1]
-    if len(counts) < LEAST_TRAJECTORIES:
-        few = f"the number of trajectories is {len(counts)}; a split by trajectory needs {LEAST_TRAJECTORIES}"
-        findings.append(Finding("warning", "split", few, "record more, or cut the log in time and number the parts"))
-    if counts.max() == 1:
-        return findings
-    rate, jitter, gaps, longest, rates = timing(data.t, data.trajectory)
-    step = f"{1 / rate:.3g} s"
-    if rate < SLOWEST:
-        remedy = "give t in seconds if it is in milliseconds or ticks"
-        findings.append(Finding("error", "time-unit", f"samples are {step} apart", remedy))
-    if gaps:
-        gapped = f"t has {gaps} gap(s): the longest step is {longest:.3g} s, the typical one {step}"
-        remedy = "cut the log at gaps, as smooth() does; rates across them are guesses"
-        findings.append(Finding("note", "gaps", gapped, remedy))
-    if jitter > JITTER:
-        findings.append(Finding("warning", "jitter", f"time steps vary by {jitter:.0%}", FILTER))
-    if np.ptp(rates) > UNEQUAL * rate:
-        unequal = f"trajectories are sampled at {rates.min():.4g} to {rates.max():.4g} Hz"
-        findings.append(Finding("note", "rates", unequal, FILTER))
-    return findings
+    few = f"the number of trajectories is {len(counts)}; a split by trajectory needs {LEAST_TRAJECTORIES}"
+    cases: list[Case] = [
+        ("warning", "split", len(counts) < LEAST_TRAJECTORIES, few,
+         "record more, or cut the log in time and number the parts"),
+    ]  # fmt: skip
+    if counts.max() > 1:
+        rate, jitter, gaps, longest, rates = timing(data.t, data.trajectory)
+        step = f"{1 / rate:.3g} s"
+        cases += [
+            ("error", "time-unit", rate < SLOWEST, f"samples are {step} apart",
+             "give t in seconds if it is in milliseconds or ticks"),
+            ("note", "gaps", gaps > 0,
+             f"t has {gaps} gap(s): the longest step is {longest:.3g} s, the typical one {step}",
+             "cut the log at gaps, as smooth() does; rates across them are guesses"),
+            ("warning", "jitter", jitter > JITTER, f"time steps vary by {jitter:.0%}", FILTER),
+            ("note", "rates", np.ptp(rates) > UNEQUAL * rate,
+             f"trajectories are sampled at {rates.min():.4g} to {rates.max():.4g} Hz", FILTER),
+        ]  # fmt: skip
+    return findings_of(*cases)
 
 
 def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding]:
     """Checks for still joints, constant torques, spikes, steps and flat tops; `rates` are qd of the filtered q."""
     still = np.ptp(data.q, axis=0) <= 1e-9 * max(1.0, np.abs(data.q).max())
     speed = np.full(len(still), np.inf) if rates is None else rates.std(axis=0)
-    weak = (speed < WEAK * np.median(speed)) & ~still
-    steps = step_of(data.q)
-    findings = on_joints(
-        "warning", "unexcited", still, "the position of {} is constant",
-        "move it in some trajectories, or leave it out of q: its inertia and friction cannot be learned",
-    )  # fmt: skip
-    findings += on_joints(
-        "warning", "unexcited", weak, f"the speed of {{}} is less than {WEAK:.0%} of that of other joints",
-        "excite it more: the log hardly shows its dynamics",
+    findings = findings_of(
+        ("warning", "unexcited", still, "the position of {} is constant",
+         "move it in some trajectories, or leave it out of q: its inertia and friction cannot be learned"),
+        ("warning", "unexcited", (speed < WEAK * np.median(speed)) & ~still,
+         f"the speed of {{}} is less than {WEAK:.0%} of that of other joints",
+         "excite it more: the log hardly shows its dynamics"),
     )  # fmt: skip
     if "tau" not in data.estimated:
         # A joint without a motor has zero torque; a passive system has only such joints.
-        constant = (np.ptp(data.tau, axis=0) == 0) & (data.tau[0] != 0)
         driven = np.ones(len(still), bool)
         if data.needs is not None and data.needs.actuation is not None:
             driven = np.any(np.asarray(data.needs.actuation) != 0, axis=1)
         dead = driven & ~data.tau.any(axis=0) & ~still
-        findings += on_joints(
-            "warning", "dead-torque", dead, "the torque of {} is zero in all samples, although the position changes",
-            "log that torque; or state in needs, by actuation, that the joint has no motor",
-        )  # fmt: skip
         fast = np.abs(data.qd) > FAST * np.sqrt(np.mean(data.qd**2, axis=0))
         zero = np.sum((data.tau == 0) & fast, axis=0) / np.maximum(fast.sum(axis=0), 1)
         hidden = driven & (zero > HIDDEN) & ~dead & ~still
-        findings += on_joints(
-            "warning", "hidden-torque", hidden,
-            f"the torque of {{}} is exactly zero in up to {zero[hidden].max(initial=0.0):.0%} of the moving samples",
-            "unless the motors were off, the drivers hide small torques: leave such joints out (--lock)",
+        findings += findings_of(
+            ("warning", "dead-torque", dead, "the torque of {} is zero in all samples, although the position changes",
+             "log that torque; or state in needs, by actuation, that the joint has no motor"),
+            ("warning", "hidden-torque", hidden,
+             f"the torque of {{}} is exactly zero in up to {zero[hidden].max(initial=0.0):.0%} of the moving samples",
+             "unless the motors were off, the drivers hide small torques: leave such joints out (--lock)"),
+            ("warning", "constant-torque", (np.ptp(data.tau, axis=0) == 0) & (data.tau[0] != 0),
+             "the torque of {} is constant", "check that the right channel was logged"),
         )  # fmt: skip
-        findings += on_joints(
-            "warning", "constant-torque", constant, "the torque of {} is constant",
-            "check that the right channel was logged",
+    for key, word, of_spikes, of_limits in (
+        ("q", "position", "leave those samples out",
+         "check whether it is at its stop or the log is clipped; leave those samples out"),
+        ("tau", "torque", "leave those samples out, or let identify weigh them by --robust",
+         "avoid the limits of the motors, or leave those samples out"),
+    ):  # fmt: skip
+        if key in data.estimated:
+            continue
+        channels = getattr(data, key)
+        spikes, steps = _spikes(channels, data.trajectory).sum(axis=0), step_of(channels)
+        pairs = zip(channels.T, steps, strict=True)
+        flat = np.array([flat_share(channel, data.trajectory, step) for channel, step in pairs])
+        findings += findings_of(
+            ("warning", "spikes", spikes > 0, f"the {word} of {{}} has {spikes.sum()} spike(s)", of_spikes),
+            ("warning", f"saturation-{key}", flat > SHARE,
+             f"the {word} of {{}} is cut off flat in up to {flat.max():.1%} of the samples", of_limits),
         )  # fmt: skip
-        findings += _saturated(data, "tau", "torque", "avoid the limits of the motors, or leave those samples out")
-    for key, word, remedy in (
-        ("q", "position", "leave those samples out"),
-        ("tau", "torque", "leave those samples out, or let identify weigh them by --robust"),
-    ):
-        if key not in data.estimated:
-            counts = _spikes(getattr(data, key), data.trajectory).sum(axis=0)
-            observation = f"the {word} of {{}} has {int(counts.sum())} spike(s)"
-            findings += on_joints("warning", "spikes", counts > 0, observation, remedy)
-    findings += _saturated(
-        data, "q", "position", "check whether it is at its stop or the log is clipped; leave those samples out"
-    )
-    return findings + on_joints(
-        "note", "quantisation", steps > COARSE, f"q of {{}} comes in steps of up to {steps.max():.2g}",
-        "filter before rates are derived: --cutoff auto, or smooth()",
+    steps = step_of(data.q)
+    return findings + findings_of(
+        ("note", "quantisation", steps > COARSE, f"q of {{}} comes in steps of up to {steps.max():.2g}",
+         "filter before rates are derived: --cutoff auto, or smooth()")
     )  # fmt: skip
 
 
@@ -187,14 +189,6 @@ def _spikes(values: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
     return mask
 
 
-def _saturated(data: Trajectories, key: str, word: str, remedy: str) -> list[Finding]:
-    channels = getattr(data, key)
-    with_steps = zip(channels.T, step_of(channels), strict=True)
-    shares = np.array([flat_share(channel, data.trajectory, step) for channel, step in with_steps])
-    observation = f"the {word} of {{}} is cut off flat in up to {shares.max():.1%} of the samples"
-    return on_joints("warning", f"saturation-{key}", shares > SHARE, observation, remedy)
-
-
 def flat_share(channel: np.ndarray, trajectory: np.ndarray, step: float) -> float:
     """Fraction of samples in runs at the largest or smallest value that are entered or left abruptly.
 
@@ -210,15 +204,14 @@ def flat_share(channel: np.ndarray, trajectory: np.ndarray, step: float) -> floa
     typical = np.median(moving) if len(moving) else np.inf
     # A smooth extreme of at least RUN samples in steps is entered and left by fewer than three steps.
     abrupt = max(ABRUPT * typical, 3 * float(step))
-    count = 0
+    jumps = np.r_[False, same & (moves > abrupt), False]  # into each sample, and out of the last
+    cut = 0
     for extreme in (channel.max(), channel.min()):
         at = np.abs(channel - extreme) <= 1e-9 * size
-        edges = np.flatnonzero(np.diff(np.r_[0, at.astype(int), 0]))
-        for first, last in edges.reshape(-1, 2):
-            beside = [place for place in (first - 1, last - 1) if 0 <= place < len(moves) and same[place]]
-            if last - first >= RUN and any(moves[place] > abrupt for place in beside):
-                count += last - first
-    return count / len(channel)
+        runs = np.flatnonzero(np.diff(np.r_[0, at.astype(int), 0])).reshape(-1, 2)
+        lengths = np.diff(runs)[:, 0]
+        cut += lengths[(lengths >= RUN) & jumps[runs].any(axis=1)].sum()
+    return float(cut / len(channel))
 
 
 def _match(
@@ -266,10 +259,8 @@ def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
     """Checks that qd is the rate of q, and qdd the rate of qd, if the file has them; `even` is smooth(data, trim=0)."""
     findings = []
     part, moves = even.data.trajectory, data.q.std(axis=0) > 0
-    derived = {"qd": (even.data.qd, "dq/dt"), "qdd": (even.data.qdd, "d²q/dt²")}
-    for key, (own, formula), (other, name) in (
-        ("qd", derived["qd"], derived["qdd"]), ("qdd", derived["qdd"], derived["qd"])
-    ):  # fmt: skip
+    derived = ("qd", even.data.qd, "dq/dt"), ("qdd", even.data.qdd, "d²q/dt²")
+    for (key, own, formula), (_, other, name) in zip(derived, derived[::-1], strict=True):
         if key in data.estimated:
             continue
         measured = _at_times_of(data, even, getattr(data, key))
@@ -279,9 +270,10 @@ def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
             / np.maximum(np.sum(x**2, axis=0) * np.sum(measured[inside] ** 2, axis=0), TINY)
             for x in (own[inside], other[inside])
         )  # fmt: skip
-        if moves.any() and ((left_other < 1 - ALIKE**2) & (left_other < EXCHANGED * left))[moves].all():
-            observation = f"{key} is {name}, not {formula}"
-            findings.append(Finding("error", f"{key}-exchanged", observation, f"exchange qd and qdd, or {RATE_REMEDY}"))
+        exchanged = ((left_other < 1 - ALIKE**2) & (left_other < EXCHANGED * left))[moves]
+        if exchanged.size and exchanged.all():
+            remedy = f"exchange qd and qdd, or {RATE_REMEDY}"
+            findings += findings_of(("error", f"{key}-exchanged", True, f"{key} is {name}, not {formula}", remedy))
             continue
         farthest = max(2, min(round(FARTHEST * even.rate), 40, len(measured) // 8))
         factor, delay, correlation, gained = _match(measured, own, part, farthest)
@@ -300,18 +292,20 @@ def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
         worst = max(delay[late], key=abs, default=0.0)
         delayed = f"up to {abs(worst) / even.rate * 1e3:.3g} ms {'late' if worst > 0 else 'early'}"
         ratios = ", ".join(f"{number:.3g}" for number in factor[odd])
-        cases: tuple[tuple[Severity, str, np.ndarray, str, str], ...] = (
-            ("error", "unit", degrees, f"is 57.3 times {formula}", f"convert {key} from degrees to radians"),
-            ("error", "unit", radians, f"is {formula} / 57.3", "convert q from degrees to radians"),
-            ("error", "unit", milli, f"is 1000 times {formula}", "give t in seconds"),
-            ("error", "sign", opposite, f"has the opposite sign of {formula}", f"change the sign of {key} or q"),
-            ("error", "unit", odd, f"is {ratios} times {formula}", f"check units and gear ratios, or {RATE_REMEDY}"),
-            ("error", "unlike", (np.abs(correlation) < UNLIKE) & moves, f"does not follow {formula}",
+        of = f"{key} of {{}}"
+        findings += findings_of(
+            ("error", f"{key}-unit", degrees, f"{of} is 57.3 times {formula}",
+             f"convert {key} from degrees to radians"),
+            ("error", f"{key}-unit", radians, f"{of} is {formula} / 57.3", "convert q from degrees to radians"),
+            ("error", f"{key}-unit", milli, f"{of} is 1000 times {formula}", "give t in seconds"),
+            ("error", f"{key}-sign", opposite, f"{of} has the opposite sign of {formula}",
+             f"change the sign of {key} or q"),
+            ("error", f"{key}-unit", odd, f"{of} is {ratios} times {formula}",
+             f"check units and gear ratios, or {RATE_REMEDY}"),
+            ("error", f"{key}-unlike", (np.abs(correlation) < UNLIKE) & moves, f"{of} does not follow {formula}",
              f"check the order of the columns, or {RATE_REMEDY}"),
-            ("warning", "delay", late, f"is {delayed} relative to q", RATE_REMEDY),
+            ("warning", f"{key}-delay", late, f"{of} is {delayed} relative to q", RATE_REMEDY),
         )  # fmt: skip
-        for severity, kind, joints, observation, remedy in cases:
-            findings += on_joints(severity, f"{key}-{kind}", joints, f"{key} of {{}} {observation}", remedy)
     return findings
 
 

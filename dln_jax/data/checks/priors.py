@@ -44,8 +44,8 @@ SCALES = (0.02, 0.3)
 """Velocity scales of dry friction, relative to the typical velocity of the joint."""
 
 
-class Log(NamedTuple):
-    """A log and the faults repaired in it."""
+class Hypothesis(NamedTuple):
+    """A log, and the faults that are repaired in it."""
 
     data: Trajectories
     rows: np.ndarray
@@ -93,14 +93,14 @@ class Prior(NamedTuple):
     """(states q, qd and qdd [m, d], R [d, m d]) -> R times the inertial torques at these states."""
 
 
-Build = Callable[[Log], Prior]
+Build = Callable[[Hypothesis], Prior]
 """Prior of the torques of a log."""
 
 
 class Explanation(NamedTuple):
     """How well a prior explains the torques of a log."""
 
-    log: Log
+    log: Hypothesis
     prior: Prior
     """Without its `parts`, which are large."""
     weights: Float[np.ndarray, " w"]
@@ -114,7 +114,7 @@ class Explanation(NamedTuple):
     """Squared prediction error of every block, relative to the variance of the joint's torque."""
 
 
-def explain(log: Log, prior: Prior, *, iterations: int = ITERATIONS) -> Explanation:
+def explain(log: Hypothesis, prior: Prior, *, iterations: int = ITERATIONS) -> Explanation:
     """Finds the maximum-likelihood weights and predicts every block from the others."""
     tau = log.torques()
     n, d = tau.shape
@@ -184,7 +184,7 @@ def blocks_of(n: int, d: int) -> list[np.ndarray]:
 def any_energy(joints: Sequence[str]) -> Build:
     """Prior without a robot: torques of an arbitrary kinetic and potential energy, gyroscopic forces and friction."""
 
-    def build(log: Log) -> Prior:
+    def build(log: Hypothesis) -> Prior:
         states = log.states()
         sizes = sizes_of(log)
 
@@ -200,7 +200,7 @@ def any_energy(joints: Sequence[str]) -> Build:
     return build
 
 
-def gyroscopic(log: Log, joints: Sequence[str]) -> list[Float[np.ndarray, "a a"]]:
+def gyroscopic(log: Hypothesis, joints: Sequence[str]) -> list[Float[np.ndarray, "a a"]]:
     """Covariance of A(q) qd for an antisymmetric A with A_ij ~ GP(0, sizes_i sizes_j k(q, q')); none for one joint.
 
     cov(tau_i, tau_j') = k sizes_i ([i = j] sum over l of sizes_l qd_l qd_l' - sizes_j qd_j qd_i').
@@ -218,7 +218,7 @@ def gyroscopic(log: Log, joints: Sequence[str]) -> list[Float[np.ndarray, "a a"]
     return [both.transpose(0, 2, 1, 3).reshape(n * d, n * d)]
 
 
-def sizes_of(log: Log) -> np.ndarray:
+def sizes_of(log: Hypothesis) -> np.ndarray:
     """Magnitudes of the joints' inertias [d] as the ratio of torques to accelerations."""
     ratios = log.torques().std(axis=0) / np.maximum(log.states()[2].std(axis=0), 1e-12)
     return np.maximum(ratios, 1e-3 * max(float(ratios.max()), 1e-300))
@@ -278,38 +278,24 @@ def _kinetic(
     kernel: tuple[np.ndarray, ...], rates: Sequence[np.ndarray], others: Sequence[np.ndarray], W: np.ndarray
 ) -> np.ndarray:
     """L_i L'_j of k (uᵀ W v)² with L_i = d/dt d/du_i - d/dq_i, over states u = qd, a = qdd and others v, b."""
-    (u, a), (v, b) = rates, others
     value, h, e = kernel
-    s, sa, sb, sab = ((left * W) @ right.T for left, right in ((u, v), (a, v), (u, b), (a, b)))
-    uh, vh = np.einsum("ni,nmi->nm", u, h), np.einsum("mi,nmi->nm", v, h)
-    U, V, A, B = (W * rate for rate in (u, v, a, b))
-    eye = np.diag(W)
+    (u, a), (v, b) = [x[:, None] for x in rates], others
+    U, A, V, B = (W * rate for rate in (u, a, v, b))
 
-    # All divided by the kernel's value: D k = uh, D' k = -vh, k_i = h_i, k_j' = -h_j, with D = u . d/dq.
-    both = -(uh * vh + np.einsum("ni,mi,nmi->nm", u, v, e))  # D D' k
-    d_other = -(uh[..., None] * h + u[:, None] * e)  # D k_j'
-    other_d = -(h * vh[..., None] + v[None] * e)  # D' k_i
-    mixed = -_hessian(h, e)  # k_ij'
+    def along(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        return np.sum(left * right, axis=-1, keepdims=True)
 
     def outer(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """The product right[m, i] left[n, j] as [n, m, i, j]."""
-        return right[None, :, :, None] * left[:, None, None, :]
+        return left[..., None] * right[..., None, :]
 
-    def scaled(scalar: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-        return scalar[..., None, None] * matrix
-
-    momentum = 2 * (outer(U, V) + scaled(s, eye))  # d/dv_j of 2 s V_i
-    momentum_b = 2 * (outer(U, B) + scaled(sb, eye))  # B of it
-    force = 2 * (outer(A, V) + scaled(sa, eye))
-    force_b = 2 * (outer(A, B) + scaled(sab, eye))
-    total = scaled(both, momentum) + scaled(uh, momentum_b)
-    total -= (2 * s[..., None] * V[None])[..., :, None] * d_other[..., None, :]
-    total += scaled(-vh, force) + force_b
-    total -= (2 * sa[..., None] * V[None])[..., :, None] * (-h)[..., None, :]
-    total -= other_d[..., :, None] * (2 * s[..., None] * U[:, None])[..., None, :]
-    total -= h[..., :, None] * (2 * sb[..., None] * U[:, None])[..., None, :]
-    total += scaled(s**2, mixed)
-    return scaled(value, total)
+    # All divided by the kernel's value: k_i = h_i, k_j' = -h_j and k_ij' = -h_i h_j - [i = j] e_i.
+    s, sa, sb, sab = along(U, v), along(A, v), along(U, b), along(A, b)
+    uh, vh = along(u, h), along(v, h)
+    both = -(uh * vh + along(u, v * e))  # D D' k with D = u . d/dq, D' = v . d/dq'
+    half = outer(V, both * U - vh * A + (sa + s * uh) * h + s * u * e)
+    half += outer(B, uh * U + A) + outer((s * vh - sb) * h + s * v * e, U)
+    half += (both * s + uh * sb - vh * sa + sab)[..., None] * np.diag(W)
+    return value[..., None, None] * (2 * half - s[..., None] ** 2 * _hessian(h, e))
 
 
 def friction(qd: Float[np.ndarray, "n d"]) -> list[np.ndarray]:

@@ -15,11 +15,12 @@ from dln_jax.data.checks.channels import (
     check_channels,
     check_derivatives,
     check_times,
+    findings_of,
 )  # fmt: skip
 from dln_jax.data.checks.priors import any_energy
 from dln_jax.data.checks.torques import Torques, check_degrees, check_torques, examine_torques
 from dln_jax.data.checks.tree import OnTree, compare_with_tree
-from dln_jax.data.encoders.sampling import Repeats, step_of, timing, without_repeats
+from dln_jax.data.encoders.sampling import step_of, timing, without_repeats
 from dln_jax.data.encoders.smoothing import Smoothed, smooth
 from dln_jax.data.repeated_motions import motion_numbers
 from dln_jax.data.robots import Robot
@@ -56,27 +57,23 @@ def read(path: str | Path, **stated: Any) -> tuple[Trajectories, list[Finding]]:
     findings: list[Finding] = []
 
     def repair(arrays: dict[str, Any]) -> dict[str, Any]:
-        t, trajectory = (np.asarray(arrays.get(key, np.zeros(0))) for key in ("t", "trajectory"))
-        if t.ndim != 1 or t.shape != trajectory.shape or not np.issubdtype(t.dtype, np.number) or not len(t):
+        t, trajectory = (np.asarray(arrays.get(key, ())) for key in ("t", "trajectory"))
+        if t.ndim != 1 or t.shape != trajectory.shape or t.dtype.kind not in "fiu" or not len(t):
             return arrays  # the schema refuses them
+        backward = np.sum(np.diff(t)[np.diff(trajectory) == 0] < 0)
         order = np.lexsort((t, trajectory))
-        same = np.r_[False, (np.diff(t[order]) == 0) & (np.diff(trajectory[order]) == 0)]
-        backward, double = int(np.sum(np.diff(t)[np.diff(trajectory) == 0] < 0)), int(same.sum())
-        if backward:
-            decreases = f"t decreases at {backward} sample(s)"
-            findings.append(Finding("error", "time-order", decreases, "sort each trajectory by time (done here)"))
-        if double:
-            repeated = f"{double} sample(s) have the time of the one before"
-            remedy = "keep one sample for each time (the first was kept here)"
-            findings.append(Finding("error", "time-double", repeated, remedy))
-        if not findings:
-            return arrays
-        per_sample = {
-            key: np.asarray(array)[order[~same]]
+        first = np.r_[True, (np.diff(t[order]) != 0) | (np.diff(trajectory[order]) != 0)]
+        findings.extend(findings_of(
+            ("error", "time-order", backward > 0, f"t decreases at {backward} sample(s)",
+             "sort each trajectory by time (done here)"),
+            ("error", "time-double", not first.all(), f"{np.sum(~first)} sample(s) have the time of the one before",
+             "keep one sample for each time (the first was kept here)"),
+        ))  # fmt: skip
+        return arrays | {
+            key: np.asarray(array)[order[first]]
             for key, array in arrays.items()
-            if np.shape(array)[:1] == t.shape and key not in ("label", "joint_names")
+            if findings and np.shape(array)[:1] == t.shape and key not in ("label", "joint_names")
         }
-        return arrays | per_sample
 
     return schema.load(path, **stated, repair=repair), findings
 
@@ -107,16 +104,29 @@ def examine(data: Trajectories, robot: Robot | None = None, *, repaired: Sequenc
                 f"the robot has {len(joints)} joints, but the data have {d}; lock those that do not move: "
                 "--lock NAME,NAME"
             )
-    findings = [*repaired, *check_times(data), *_repeated_motions(data)]
+    findings = [*repaired, *check_times(data)]
     distinct, repeats = without_repeats(data)
-    findings += _repeated(repeats)
+    kinds = {"rows": repeats.rows, "q": repeats.q & ~repeats.rows, "tau": repeats.tau & ~repeats.rows}
+    counts = {name: int(where.sum()) for name, where in kinds.items() if where.any()}
+    listed = ", ".join(f"{count} of {name}" for name, count in counts.items())
+    why = "the log is faster than its source" if repeats.inserted else "messages were lost"
+    recordings, numbers = len(np.unique(data.trajectory)), motion_numbers(data.q, data.trajectory)
+    motions = len(np.unique(numbers[numbers >= 0]))
+    findings += findings_of(
+        ("note", "repeated-motions", motions != recordings,
+         f"{recordings} recordings show {motions} motion{'s' * (motions > 1)}",
+         "errors on other motions are known only if some are held out; record more of them"),
+        ("warning", "repeated", bool(counts),
+         f"{sum(counts.values())} sample(s) repeat the one before while the robot moves ({listed}): {why}",
+         "resample over them with smooth() or --cutoff auto"),
+    )  # fmt: skip
     try:
         even = smooth(data, trim=0.0)  # which removes the repeats itself, and knows where they were
     except InputError:  # single states, or motions of a few samples: their rates cannot be checked
         even = None
     if even is not None and even.clock is not None:
         findings = [finding for finding in findings if finding.check != "jitter"]
-        findings.append(Finding("warning", "arrival", even.clock.line, FILTER))
+        findings += findings_of(("warning", "arrival", True, even.clock.line, FILTER))
     findings += check_channels(data, None if even is None else even.data.qd)
     driven = "tau" not in data.estimated and bool(np.ptp(distinct.tau, axis=0).any())
     farthest = 0 if even is None else int(np.clip(round(FARTHEST * even.rate), 2, MOST_SHIFTS))
@@ -129,9 +139,8 @@ def examine(data: Trajectories, robot: Robot | None = None, *, repaired: Sequenc
         sound = not any(finding.severity == "error" or finding.check in BLINDING for finding in findings)
         direct = needs is None or (needs.actuation is None and needs.joint_map is None)
         if driven and sound and robot is None and direct and np.ptp(distinct.tau, axis=0).all():
-            torques = examine_torques(
-                even.data, any_energy(tuple(joints)), farthest=farthest, equations=equations, alone=True
-            )
+            prior = any_energy(tuple(joints))
+            torques = examine_torques(even.data, prior, farthest=farthest, equations=equations, alone=True)
         if torques is not None:
             stated = needs is not None and bool(needs.friction or needs.joint_friction)
             findings += check_torques(torques, friction_stated=stated, with_robot=False)
@@ -145,38 +154,14 @@ def examine(data: Trajectories, robot: Robot | None = None, *, repaired: Sequenc
     return Examination(findings, data, even, torques, on_tree)
 
 
-def _repeated(repeats: Repeats) -> list[Finding]:
-    count = int((repeats.q | repeats.tau).sum())
-    if not count:
-        return []
-    kinds = {"rows": repeats.rows, "q": repeats.q & ~repeats.rows, "tau": repeats.tau & ~repeats.rows}
-    counted = ", ".join(f"{int(where.sum())} of {name}" for name, where in kinds.items() if where.any())
-    why = "the log is faster than its source" if repeats.inserted else "messages were lost"
-    observation = f"{count} sample(s) repeat the one before while the robot moves ({counted}): {why}"
-    return [Finding("warning", "repeated", observation, "resample over them with smooth() or --cutoff auto")]
-
-
-def _repeated_motions(data: Trajectories) -> list[Finding]:
-    recordings, numbers = len(np.unique(data.trajectory)), motion_numbers(data.q, data.trajectory)
-    motions = len(np.unique(numbers[numbers >= 0]))
-    if motions == recordings:
-        return []
-    observation = f"{recordings} recordings show {motions} motion{'s' * (motions > 1)}"
-    remedy = "errors on other motions are known only if some are held out; record more of them"
-    return [Finding("note", "repeated-motions", observation, remedy)]
-
-
 def _noise(data: Trajectories, even: Smoothed) -> list[Finding]:
     """Reports accelerations from unfiltered differences of a noisy q."""
-    estimated = any(key in data.estimated for key in ("qd", "qdd"))
-    if not estimated or np.isinf(even.cutoff) or even.choice is None:
-        return []
     amplified = even.noise_q * (even.rate * np.sqrt(6) / 4)  # of central differences taken twice: sqrt(6) / (4 dt²)
-    share = amplified * even.rate / np.maximum(even.data.qdd.std(axis=0), np.finfo(float).tiny)
-    if share.max() < 0.05:
-        return []
-    observation = f"accelerations by differences of this q have noise of {100 * share.max():.0f} % of their size"
-    return [Finding("warning", "raw-differences", observation, ESTIMATED)]
+    share = np.max(amplified * even.rate / np.maximum(even.data.qdd.std(axis=0), np.finfo(float).tiny))
+    estimated = "qdd" in data.estimated or "qd" in data.estimated
+    noisy = estimated and np.isfinite(even.cutoff) and even.choice is not None and share >= 0.05
+    observation = f"accelerations by differences of this q have noise of {100 * share:.0f} % of their size"
+    return findings_of(("warning", "raw-differences", noisy, observation, ESTIMATED))
 
 
 def report(examined: Examination, name: str) -> list[str]:

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.data.checks.channels import TURNS, Finding, away_from_ends, on_joints, vertex
-from dln_jax.data.checks.priors import BLOCKS, SCALES, Build, Explanation, Log, any_energy, blocks_of, explain
+from dln_jax.data.checks.channels import TURNS, Finding, away_from_ends, findings_of, vertex
+from dln_jax.data.checks.priors import BLOCKS, SCALES, Build, Explanation, Hypothesis, any_energy, blocks_of, explain
 from dln_jax.data.schema import Trajectories
 
 DECISIVE = 15.0
@@ -94,7 +94,7 @@ def examine_torques(
     farthest: int,
     equations: int,
     alone: bool = False,
-    others: Callable[[Log], list[Log]] = lambda _: [],
+    others: Callable[[Hypothesis], list[Hypothesis]] = lambda _: [],
 ) -> Torques | None:
     """Searches for wrong signs, exchanged columns, a delay and `others`; `None` with too few samples.
 
@@ -120,14 +120,14 @@ def examine_torques(
     return Torques(recorded, now, np.arange(-farthest, farthest + 1.0), loss, likely, *_friction(now)[:-1])
 
 
-def _sampled(data: Trajectories, farthest: int, equations: int) -> Log | None:
+def _sampled(data: Trajectories, farthest: int, equations: int) -> Hypothesis | None:
     """Samples for so many equations, with room for the delay; `None` with too few."""
     d = data.degrees_of_freedom
     inside = away_from_ends(data.trajectory, farthest + 1)
     count = min(equations // d, len(inside))
     if count < 2 * BLOCKS:
         return None
-    return Log(data, inside[np.linspace(0, len(inside) - 1, count).astype(int)], np.ones(d), tuple(range(d)))
+    return Hypothesis(data, inside[np.linspace(0, len(inside) - 1, count).astype(int)], np.ones(d), tuple(range(d)))
 
 
 def _late(now: Explanation, farthest: int) -> tuple[np.ndarray, float]:
@@ -145,7 +145,7 @@ def _late(now: Explanation, farthest: int) -> tuple[np.ndarray, float]:
 
 
 def _better(
-    now: Explanation, build: Build, farthest: int, others: Callable[[Log], list[Log]], *, alone: bool
+    now: Explanation, build: Build, farthest: int, others: Callable[[Hypothesis], list[Hypothesis]], *, alone: bool
 ) -> Explanation | None:
     """The log with its likeliest fault repaired, if that is decisive; `alone` judges by the joints concerned."""
     log, d = now.log, len(now.log.order)
@@ -180,14 +180,14 @@ def _better(
     return max(better, key=lambda then: then.densities.sum(), default=None)
 
 
-def _likeliest(log: Log, trials: list[Log], build: Build) -> list[Log]:
+def _likeliest(log: Hypothesis, trials: list[Hypothesis], build: Build) -> list[Hypothesis]:
     """The few faults that are likelier than the log as recorded, judged from fewer samples and rough weights."""
     if not trials:
         return []
     rows = log.rows[:: -(-len(log.rows) * len(log.order) // SCANNED)]
     prior = functools.cache(lambda order: build(log._replace(rows=rows, order=order)))
 
-    def density(trial: Log) -> float:
+    def density(trial: Hypothesis) -> float:
         few = explain(trial._replace(rows=rows), prior(trial.order), iterations=ROUGHLY)
         return float(few.densities.sum())
 
@@ -262,31 +262,27 @@ def _friction(now: Explanation) -> tuple[np.ndarray, ...]:
 def check_torques(torques: Torques, *, friction_stated: bool, with_robot: bool) -> list[Finding]:
     """Turns the examination of torques into findings."""
     log = torques.repaired.log
-    findings = on_joints(
-        "error", "tree-sign" if with_robot else "torque-sign", log.signs < 0,
-        f"the torque of {{}} has the wrong sign ({torques.gain})", "change the sign of that tau or that q",
-    )  # fmt: skip
     columns = ", ".join(str(source + 1) for source in log.order)
-    findings += on_joints(
-        "error", "order", np.array(log.order) != np.arange(len(log.order)),
-        f"the torques of {{}} are exchanged: columns {columns} of tau fit q ({torques.gain})",
-        "order the columns of tau as those of q",
+    step = 1e3 * float(np.median(np.diff(log.data.t)[np.diff(log.data.trajectory) == 0]))
+    late = f"{abs(log.delay) * step:.3g} ms {'late' if log.delay > 0 else 'early'}"
+    findings = findings_of(
+        ("error", "tree-sign" if with_robot else "torque-sign", log.signs < 0,
+         f"the torque of {{}} has the wrong sign ({torques.gain})", "change the sign of that tau or that q"),
+        ("error", "order", np.array(log.order) != np.arange(len(log.order)),
+         f"the torques of {{}} are exchanged: columns {columns} of tau fit q ({torques.gain})",
+         "order the columns of tau as those of q"),
+        ("warning", "delay", log.delay != 0, f"torques are {late} relative to positions ({torques.gain})",
+         "shift one of them in time, or correct the clock of the log"),
     )  # fmt: skip
-    if log.delay:
-        step = 1e3 * float(np.median(np.diff(log.data.t)[np.diff(log.data.trajectory) == 0]))
-        late = f"{abs(log.delay) * step:.3g} ms {'late' if log.delay > 0 else 'early'}"
-        observation = f"torques are {late} relative to positions ({torques.gain})"
-        remedy = "shift one of them in time, or correct the clock of the log"
-        findings.append(Finding("warning", "delay", observation, remedy))
-    elif not friction_stated and not findings:
-        size = log.torques().std(axis=0)
-        sure = (torques.explained > TRUSTED) & (torques.coulomb > np.maximum(DRY * size, SURE * torques.coulomb_error))
-        sizes = ", ".join(f"{dry:.2g}" for dry in torques.coulomb[sure])
-        findings += on_joints(
-            "note", "friction", sure, f"friction is seen at {{}} (dry: about {sizes})",
-            'state it: --needs \'{"joints": [...], "joint_friction": ["viscous", "coulomb"]}\'',
-        )  # fmt: skip
-    return findings
+    if findings or friction_stated:
+        return findings
+    least = np.maximum(DRY * log.torques().std(axis=0), SURE * torques.coulomb_error)
+    sure = (torques.explained > TRUSTED) & (torques.coulomb > least)
+    sizes = ", ".join(f"{dry:.2g}" for dry in torques.coulomb[sure])
+    return findings_of(
+        ("note", "friction", sure, f"friction is seen at {{}} (dry: about {sizes})",
+         'state it: --needs \'{"joints": [...], "joint_friction": ["viscous", "coulomb"]}\'')
+    )  # fmt: skip
 
 
 def check_degrees(data: Trajectories, joints: tuple[str, ...], *, driven: bool) -> list[Finding]:
@@ -302,13 +298,11 @@ def check_degrees(data: Trajectories, joints: tuple[str, ...], *, driven: bool) 
         return np.nan if log is None else float(explain(log, any_energy(joints)(log)).unexplained.mean())
 
     converted = data._replace(q=data.q * factor, qd=data.qd * factor, qdd=data.qdd * factor)
-    if (driven and unexplained(converted) < 0.7 * unexplained(data)) or largest.max() >= 10 * TURNS:
-        return on_joints(
-            "error", "q-unit", large, f"q of {{}} goes to {largest.max():.3g}, far beyond two turns",
-            "convert to radians if these are degrees, or divide by the gear ratio if they are the motor's",
-        )  # fmt: skip
-    return on_joints(
-        "note", "q-unit", large,
-        f"q of {{}} goes to {largest.max():.3g} rad, which is {largest.max() / 2 / np.pi:.1f} turns",
-        "ignore this if the joint turns without limit; else convert from degrees, or divide by the gear ratio",
+    wrong = (driven and unexplained(converted) < 0.7 * unexplained(data)) or largest.max() >= 10 * TURNS
+    reach = f"q of {{}} goes to {largest.max():.3g}"
+    return findings_of(
+        ("error", "q-unit", large & wrong, f"{reach}, far beyond two turns",
+         "convert to radians if these are degrees, or divide by the gear ratio if they are the motor's"),
+        ("note", "q-unit", large & (not wrong), f"{reach} rad, which is {largest.max() / 2 / np.pi:.1f} turns",
+         "ignore this if the joint turns without limit; else convert from degrees, or divide by the gear ratio"),
     )  # fmt: skip

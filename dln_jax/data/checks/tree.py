@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from dln_jax.data.checks.channels import Finding, away_from_ends, on_joints
-from dln_jax.data.checks.priors import Build, Inertias, Log, Prior, friction, gyroscopic, sizes_of
+from dln_jax.data.checks.channels import Finding, away_from_ends, findings_of
+from dln_jax.data.checks.priors import Build, Hypothesis, Inertias, Prior, friction, gyroscopic, sizes_of
 from dln_jax.data.checks.torques import Torques, check_torques, examine_torques
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
@@ -100,10 +100,11 @@ def compare_with_tree(
     weighted = (columns / sizes[:, None]).reshape(n * d, -1)
     determined = least_squares.solve(weighted, (tau / sizes).ravel(), rank_tolerance=RANK, negligible=1e-9)
     facts = determined.rank, weighted.shape[1], determined.condition
-    if determined.condition > ILL:
-        observation = f"the condition of the regressor is {determined.condition:.3g}"
-        remedy = "excite the arm more: faster, over larger ranges, all joints at a time"
-        findings.append(Finding("warning", "condition", observation, remedy))
+    findings += findings_of(
+        ("warning", "condition", determined.condition > ILL,
+         f"the condition of the regressor is {determined.condition:.3g}",
+         "excite the arm more: faster, over larger ranges, all joints at a time")
+    )  # fmt: skip
     if not driven:
         return OnTree(findings, *facts, np.full(d, np.nan), np.full(3, np.nan), None)
     still = np.zeros_like(q)
@@ -136,30 +137,27 @@ def compare_with_tree(
         # A column order that differs from the robot's changes the size of torques too, so it is tested before gears.
         correlation = np.divide(product, np.sqrt(own * other), out=np.zeros(d), where=known)
         geared = (np.abs(correlation) > RELATED) & ((np.abs(scale) > GEAR) | (np.abs(scale) < 1 / GEAR))
-        findings += _better_order(phi, theta, down, samples, rubbing) or on_joints(
-            "error", "gear", geared,
-            f"the torque of {{}} is {', '.join(f'{factor:.3g}' for factor in scale[geared])} times the tree's",
-            "give torques on the link's side: times the gear ratio, or times the torque constant if it is a current",
+        findings += _better_order(phi, theta, down, samples, rubbing) or findings_of(
+            ("error", "gear", geared,
+             f"the torque of {{}} is {', '.join(f'{factor:.3g}' for factor in scale[geared])} times the tree's",
+             "give torques on the link's side: times the gear ratio, or times the torque constant if it is a current")
         )  # fmt: skip
     return OnTree(findings, *facts, scale, estimate, torques)
 
 
 def _names_and_limits(data: Trajectories, robot: Robot, names: tuple[str, ...]) -> list[Finding]:
     """Checks joint names and their order, if both have names, and that positions are within the robot's limits."""
-    findings, stated = [], robot.tree.names
-    if names and stated and names != stated:
-        observation = f"the data's joints are {', '.join(names):.200}, the robot's {', '.join(stated):.200}"
-        findings = [
-            Finding("error", "order", observation, "order the columns as the robot does")
-            if set(names) == set(stated)
-            else Finding("note", "order", observation, "check that the columns are in the robot's order")
-        ]
+    stated = robot.tree.names
+    unlike, same = bool(names and stated and names != stated), set(names) == set(stated)
+    both = f"the data's joints are {', '.join(names):.200}, the robot's {', '.join(stated):.200}"
     lower, upper = robot.position_limits.T
     beyond = np.mean((data.q < lower - TOLERANCE) | (data.q > upper + TOLERANCE), axis=0)
-    return findings + on_joints(
-        "warning", "limits", beyond > 1e-3,
-        f"q of {{}} is outside the robot's limits in up to {beyond.max():.0%} of the samples",
-        "check units, zeros and signs of q, and the order of the joints",
+    return findings_of(
+        ("error", "order", unlike and same, both, "order the columns as the robot does"),
+        ("note", "order", unlike and not same, both, "check that the columns are in the robot's order"),
+        ("warning", "limits", beyond > 1e-3,
+         f"q of {{}} is outside the robot's limits in up to {beyond.max():.0%} of the samples",
+         "check units, zeros and signs of q, and the order of the joints"),
     )  # fmt: skip
 
 
@@ -202,7 +200,7 @@ def near_tree(
     spread = np.hstack([mass, mass * LENGTH * np.ones((1, 3)), mass * LENGTH**2 * np.ones((1, 6))])
     sizes = np.maximum(bodies, spread).ravel()
 
-    def build(log: Log) -> Prior:
+    def build(log: Hypothesis) -> Prior:
         states, scales = log.states(), sizes_of(log)
 
         def weighted(columns: np.ndarray) -> list[np.ndarray]:
@@ -223,8 +221,8 @@ def near_tree(
 
 
 def _mounted_or_paced(
-    log: Log, inertial: float, estimate: np.ndarray, down: np.ndarray, *, of_clock: bool
-) -> list[Log]:
+    log: Hypothesis, inertial: float, estimate: np.ndarray, down: np.ndarray, *, of_clock: bool
+) -> list[Hypothesis]:
     """The log without gravity or of a robot with its base turned, and at another speed, as the data suggest."""
     if log.gravity is not None:
         return []
