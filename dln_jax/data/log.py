@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from dln_jax.data import schema
 from dln_jax.data.checks.channels import Finding
@@ -27,7 +26,7 @@ from dln_jax.data.splits import (
 )
 from dln_jax.mechanics.friction import USUAL
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.types import InputError, Needs
+from dln_jax.types import InputError, JointVector, Needs
 
 NO_GRAVITY = "no-gravity"
 """Check for torques from which a robot's controller has subtracted gravity."""
@@ -87,7 +86,7 @@ class Log(NamedTuple):
         return f"torques low-passed at {self.smoothed.cutoff:.3g} Hz (measured ones scatter more)"
 
     @property
-    def torque_noise(self) -> Float[np.ndarray, " d"] | None:
+    def torque_noise(self) -> JointVector | None:
         """Standard deviation of the noise of filtered torques, N m or N; `None` if they are not filtered."""
         return None if self.smoothed is None or not self.smoothed.filtered_torque else self.smoothed.noise_tau
 

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from dln_jax.data.joints import PER_JOINT, match_names
 from dln_jax.data.schema import Trajectories
-from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.types import InputError, SampleIndex, SampleVector, require_positive, require_seed
 
 PER_SAMPLE = ("t", "trajectory", *PER_JOINT)
 LEAST_TRAJECTORIES = 3
@@ -77,9 +77,7 @@ def with_joints(data: Trajectories, names: Sequence[str]) -> Trajectories:
     return data._replace(**columns, joint_names=np.array(names), needs=needs, remarks=tuple(remarks))
 
 
-def segments(
-    t: Float[np.ndarray, " N"], trajectory: Int[np.ndarray, " N"], *, gap: float = GAP
-) -> list[Int[np.ndarray, " n"]]:
+def segments(t: SampleVector, trajectory: SampleIndex, *, gap: float = GAP) -> list[Int[np.ndarray, " n"]]:
     """Sample indices of the segments of all trajectories, cut at steps longer than `gap` times the median step.
 
     Raises:

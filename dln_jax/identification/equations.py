@@ -29,10 +29,9 @@ from dln_jax.learning.linear import design, design_chunks, require_linear, unrav
 from dln_jax.mechanics.trees.inertia import PARAMETERS
 from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers.least_squares import scaled_columns
-from dln_jax.types import InputError
+from dln_jax.types import InputError, JointSamples, JointVector
 
 ParameterVector = Float[np.ndarray, " P"]
-JointVector = Float[np.ndarray, " d"]
 Kind = Literal["inertia", "positive", "signed", "coupling"]
 Determinacy = Literal["alone", "in combination", "not at all"]
 PREFERRED = ("I_zz", "h_x", "h_y", "I_xx", "I_xy", "I_xz", "I_yz", "I_yy", "h_z", "m")
@@ -149,7 +148,7 @@ def regressor_of(
     return passes
 
 
-def compress(regressor: Regressor, weights: Float[np.ndarray, "N d"] | None = None) -> Equations:
+def compress(regressor: Regressor, weights: JointSamples | None = None) -> Equations:
     """Compresses the equations to triangular factors, with rows scaled by the square root of `weights`, if any."""
     triangles, samples = None, 0
     for columns, tau in regressor():
@@ -174,7 +173,7 @@ def squares(equations: Equations, theta: ParameterVector) -> JointVector:
     return np.sum((equations.triangles @ np.append(theta, -1.0)) ** 2, axis=1)
 
 
-def residuals(regressor: Regressor, theta: ParameterVector) -> Float[np.ndarray, "N d"]:
+def residuals(regressor: Regressor, theta: ParameterVector) -> JointSamples:
     """tau - Phi theta of every sample."""
     return np.concatenate([tau - columns @ theta for columns, tau in regressor()])
 

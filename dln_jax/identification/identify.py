@@ -14,7 +14,6 @@ from dln_jax.identification.equations import (
     BaseParameters,
     Columns,
     Determinacy,
-    JointVector,
     ParameterVector,
     columns_of,
     compress,
@@ -24,7 +23,7 @@ from dln_jax.identification.equations import (
 from dln_jax.identification.weighted import ROUNDING, WeightedFit, correlation_times, fit_robust, fit_weighted
 from dln_jax.learning.linear import unravelled
 from dln_jax.models.model import Model, Parameters
-from dln_jax.types import InputError, JointKind
+from dln_jax.types import InputError, JointKind, JointVector
 
 STATES = 40
 """Number of random states per joint for computing the structure."""

@@ -29,13 +29,13 @@ from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.identification.consistent import fit_consistent
-from dln_jax.identification.equations import Columns, JointVector, ParameterVector
+from dln_jax.identification.equations import Columns, ParameterVector
 from dln_jax.learning.linear import unravelled
 from dln_jax.learning.shooting import MeasuredWindows, cut_measured_windows, motion, without_start
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model
 from dln_jax.precision import quick_compilation
-from dln_jax.types import InputError, require_positive
+from dln_jax.types import InputError, JointVector, require_positive
 
 ROUNDS, SETTLED = 12, 1e-4
 """Largest number of linearisations, and the smallest relative decrease of the sum that continues them."""

@@ -32,7 +32,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split
@@ -43,7 +42,7 @@ from dln_jax.learning.objectives import TORQUE, Objective
 from dln_jax.learning.uncertainty import effective_samples
 from dln_jax.models.model import Model, Parameters, make_delan
 from dln_jax.solvers.normal_equations import count
-from dln_jax.types import Needs, require_seed
+from dln_jax.types import Needs, SampleVector, require_seed
 
 MANY_JOINTS = 4
 """Arms with fewer joints get a small network and all their samples."""
@@ -89,9 +88,7 @@ def problem(model: Model, sets: Split, objective: Objective = TORQUE, *, seeds: 
     return Problem(residual, initial(numbers), fitted, score, numbers)
 
 
-def validation_errors(
-    model: Model, sets: Split, parameters: Parameters, objective: Objective = TORQUE
-) -> Float[np.ndarray, " N"]:
+def validation_errors(model: Model, sets: Split, parameters: Parameters, objective: Objective = TORQUE) -> SampleVector:
     """Squared error of every validation sample; their mean selects the parameters."""
     scale, (_, batch, _) = _read(model, sets, objective)
     return np.asarray(jax.jit(lambda theta: _squares(objective, model, theta, batch, scale))(parameters))

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.engine.problem import arrays_of
@@ -34,7 +33,7 @@ from dln_jax.models.model import Model
 from dln_jax.models.trees import WARM, RigidTreeParameters, Rows, make_rigid_tree
 from dln_jax.precision import quick_compilation
 from dln_jax.solvers.separable import SeparableSolution, solve_separable
-from dln_jax.types import FrictionLaw, InputError
+from dln_jax.types import FrictionLaw, InputError, JointVector
 
 FIRST_LOAD = 0.05
 LONGEST_STEP = 1.0
@@ -212,9 +211,9 @@ class FrictionFit(NamedTuple):
     parameters: RigidTreeParameters
     standard_errors: RigidTreeParameters
     """Standard error of every parameter, in its unit, within the space that the data determine."""
-    shape: dict[str, Float[np.ndarray, " d"]]
+    shape: dict[str, JointVector]
     """Fitted entries of `FrictionShape`, "load", and "cooling" (k, 1/K)."""
-    shape_errors: dict[str, Float[np.ndarray, " d"]]
+    shape_errors: dict[str, JointVector]
     """Standard errors of the entries of `shape`, in their units."""
     keywords: dict[str, Any]
     """Keywords of `make_rigid_tree` for the model, without its laws: shapes, motors, and with cooling the reference

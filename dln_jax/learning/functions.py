@@ -41,7 +41,7 @@ from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers
 from dln_jax.precision import data_type
-from dln_jax.types import InputError, Scalar, require_positive, require_seed
+from dln_jax.types import InputError, SampleVector, Scalar, require_positive, require_seed
 
 LOSSES = ("type1", "type2")
 MISSING = {
@@ -196,7 +196,7 @@ def grow_width(sets: SampleSplit, network: Network, fit: Callable[[Network], Tra
         errors = jax.vmap(lambda member: of_sample(member, *sample))(layers)
         return jnp.mean(jnp.sum(errors**2, axis=1))
 
-    def fit_and_judge(candidate: Network) -> tuple[Training, Float[np.ndarray, " N"]]:
+    def fit_and_judge(candidate: Network) -> tuple[Training, SampleVector]:
         training = fit(candidate)
         return training, np.asarray(squares(training.parameters, held_out))
 

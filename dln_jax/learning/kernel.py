@@ -30,7 +30,7 @@ from dln_jax.mechanics.friction import FrictionShape, coefficients_of, unit_forc
 from dln_jax.models.joint_friction import FrictionParameters
 from dln_jax.models.kernel import KernelParameters, KernelScales, States, torque_covariance
 from dln_jax.precision import quick_compilation
-from dln_jax.types import InputError, JointKind, Needs, require_positive
+from dln_jax.types import InputError, JointKind, JointSamples, JointVector, Needs, SampleVector, require_positive
 from dln_jax.zoo.descriptions import make
 
 NOISIER = 3.0
@@ -54,7 +54,7 @@ class KernelFit(NamedTuple):
 
     parameters: Any
     """Parameters of the catalogue's `trigonometric-kernel`, in float64, for `samples` samples."""
-    noise: Float[np.ndarray, " d"]
+    noise: JointVector
     """Standard deviation of the torque noise in the equations, N m or N, including torque that no such energy explains.
     It exceeds the most likely value if rounding would otherwise make the covariance indefinite."""
     likelihood: float
@@ -139,7 +139,7 @@ def choose_kernel(
     with jax.enable_x64(True):
         scale = np.asarray(torque_scale(train))
 
-    def fit(serial: bool) -> tuple[KernelFit, Float[np.ndarray, " N"]]:
+    def fit(serial: bool) -> tuple[KernelFit, SampleVector]:
         solution = fit_kernel(needs, train, samples=samples, serial=serial)
         model = make("trigonometric-kernel", needs, samples=solution.samples, serial=serial)
         errors = squared_torque_errors(model, solution.parameters, validation, scale)
@@ -148,9 +148,7 @@ def choose_kernel(
     return select((True, False), fit, rule=lowest)
 
 
-def _factor(
-    covariance: Float[np.ndarray, "Nd Nd"], noise: Float[np.ndarray, " d"], unit: Float[np.ndarray, " d"]
-) -> tuple[Any, Float[np.ndarray, " d"]]:
+def _factor(covariance: Float[np.ndarray, "Nd Nd"], noise: JointVector, unit: JointVector) -> tuple[Any, JointVector]:
     """Returns the Cholesky factor of the covariance with noise, and the noise, raised as far as rounding requires."""
     from scipy.linalg import cho_factor
 
@@ -167,7 +165,7 @@ def _factor(
     )
 
 
-def _friction(needs: Needs, qd: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N d P"]:
+def _friction(needs: Needs, qd: JointSamples) -> Float[np.ndarray, "N d P"]:
     """Torques of one unit of every friction coefficient."""
     d = needs.degrees_of_freedom
     if "load" in needs.joint_friction:

@@ -21,7 +21,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
@@ -30,7 +29,7 @@ from dln_jax.models.model import Model, Parameters, linearised
 from dln_jax.precision import quick_compilation
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
-from dln_jax.types import InputError, Needs, require_positive
+from dln_jax.types import InputError, Needs, SampleVector, require_positive
 from dln_jax.zoo.descriptions import make
 
 LARGEST_DEGREE = 4
@@ -177,7 +176,7 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
     scale = np.asarray(torque_scale(train))
     target = ROUNDING**2 * float(np.mean(np.sum((validation.tau / scale) ** 2, axis=1)))
 
-    def fit(degrees: tuple[int, ...]) -> tuple[LinearFit, Float[np.ndarray, " N"]]:
+    def fit(degrees: tuple[int, ...]) -> tuple[LinearFit, SampleVector]:
         with jax.enable_x64(True):
             model = make("trigonometric", needs, degree=degrees)
             solution = fit_linear(model, train)

@@ -21,7 +21,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
 
 from dln_jax.data.arrays import on_device, spread
 from dln_jax.data.schema import Trajectories, momenta
@@ -32,7 +31,7 @@ from dln_jax.learning.shooting import Gauge, check_gauge, gauge_error
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers import least_squares
-from dln_jax.types import require_positive, require_seed
+from dln_jax.types import SampleVector, require_positive, require_seed
 
 
 def rate_residual(model: Model, parameters: Parameters, q: Array, p: Array, qd: Array, pd: Array) -> Array:
@@ -69,7 +68,7 @@ def rates_problem(
 
 def match_linear(
     model: Model, data: Trajectories, *, validation: Trajectories | None = None
-) -> tuple[Training, Float[np.ndarray, " N"]]:
+) -> tuple[Training, SampleVector]:
     """Fits a field that is linear in its parameters by least squares, in float64, and returns the validation errors.
 
     The errors are the squared errors of the validation samples, or of the fitted ones without a validation.

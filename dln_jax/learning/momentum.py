@@ -36,7 +36,7 @@ from dln_jax.models.model import Model
 from dln_jax.precision import quick_compilation
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
-from dln_jax.types import InputError, Vector, require_positive
+from dln_jax.types import InputError, JointVector, Vector, require_positive
 
 WINDOW = 0.16
 """Length of a window in s: about two periods of the highest frequency that a low-pass at 12 Hz passes."""
@@ -80,7 +80,7 @@ def fit_momentum(
     data: Trajectories,
     *,
     window: float = WINDOW,
-    noise: Float[np.ndarray, " d"] | None = None,
+    noise: JointVector | None = None,
     reweighted: bool = False,
     **tolerances: Any,
 ) -> WeakFit:

@@ -14,7 +14,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.learning.engine.problem import arrays_of
 from dln_jax.mechanics.equations import Energies, System, driving_force, dynamics, hamiltonian_of
 from dln_jax.models.model import Model, Parameters
-from dln_jax.types import InputError, Vector
+from dln_jax.types import InputError, JointSamples, JointVector, Vector
 from dln_jax.zoo.catalogue import CATALOGUE
 
 
@@ -140,9 +140,7 @@ def residuals(objective: Objective, system: System, batch: tuple[Array, ...]) ->
     return vmap(lambda *sample: objective.residual(system, *sample))(*batch)
 
 
-def squared_torque_errors(
-    model: Model, parameters: Parameters, data: Trajectories, scale: Float[np.ndarray, " d"]
-) -> Float[np.ndarray, "N d"]:
+def squared_torque_errors(model: Model, parameters: Parameters, data: Trajectories, scale: JointVector) -> JointSamples:
     """Squared torque error of every sample and joint, computed in float64, in units of the squared scale."""
     with jax.enable_x64(True):
         judge = jax.jit(lambda theta, batch: residuals(TORQUE, model.energies(theta), batch))

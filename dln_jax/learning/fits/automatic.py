@@ -15,7 +15,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from dln_jax.data.arrays import spread
 from dln_jax.data.encoders.sampling import noise_of
@@ -34,7 +33,7 @@ from dln_jax.learning.objectives import squared_torque_errors, torque_scale
 from dln_jax.learning.select import Trial, lowest, mean_of_segments, say_selection, select, simplest
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.errors import definiteness
-from dln_jax.types import InputError, Needs
+from dln_jax.types import InputError, JointVector, Needs
 from dln_jax.zoo.run import load
 
 SELECTION_SECONDS, CANDIDATE_SECONDS = 300.0, 120.0
@@ -83,7 +82,7 @@ def compare(
     train: Trajectories,
     validation: Trajectories,
     *,
-    noise: Float[np.ndarray, " d"] | float,
+    noise: JointVector | float,
     until: float,
     definite: Callable[[Any], bool],
     say: Callable[[str], None],

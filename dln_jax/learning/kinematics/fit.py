@@ -29,7 +29,7 @@ from dln_jax.learning.objectives import torque_scale
 from dln_jax.models.trees import SerialTreeParameters, make_serial_tree
 from dln_jax.precision import quick_compilation
 from dln_jax.solvers import least_squares
-from dln_jax.types import InputError, Needs, require_positive
+from dln_jax.types import InputError, JointVector, Needs, require_positive
 
 FINALISTS, NEAR = 3, 2.0
 """Largest number of local minima to refine and compare by validation, and largest ratio of their loss to the lowest."""
@@ -49,7 +49,7 @@ class TreeFit(NamedTuple):
     frames: Frames
     torque_mse: float
     """Mean over the fitted samples of the sum of squared errors over joints; (N m)² or N²."""
-    joint_mse: Float[np.ndarray, " d"]
+    joint_mse: JointVector
     """Mean squared error of every joint over the fitted samples, (N m)² or N²."""
     validation_error: float
     """`torque_mse` of the validation samples; NaN without any."""
@@ -195,9 +195,9 @@ def _refine(
     structure: Structure,
     state: Descent,
     samples: Samples,
-    scale: Float[np.ndarray, " d"],
+    scale: JointVector,
     settings: Search,
-) -> tuple[Descent, Float[np.ndarray, " d"]]:
+) -> tuple[Descent, JointVector]:
     """Continues the descent on all samples, then with the joints' residual torques as units."""
     unit = scale
     for last in range(ROUNDS + 1):
@@ -208,7 +208,7 @@ def _refine(
 
 
 def _solve(
-    columns: Callable, state: Descent, unit: Float[np.ndarray, " d"], data: Trajectories, rank_tolerance: float
+    columns: Callable, state: Descent, unit: JointVector, data: Trajectories, rank_tolerance: float
 ) -> least_squares.LeastSquaresSolution:
     """Solves for the linear parameters of known frames on all data, by singular values."""
 
@@ -219,7 +219,7 @@ def _solve(
     return least_squares.solve_chunks(equations(), rank_tolerance=rank_tolerance, negligible=1e-12)
 
 
-def _joint_errors(columns: Callable, frames: Frames, linear: np.ndarray, data: Trajectories) -> Float[np.ndarray, " d"]:
+def _joint_errors(columns: Callable, frames: Frames, linear: np.ndarray, data: Trajectories) -> JointVector:
     chunks = design_chunks(columns, frames, data, CHUNK)
     return np.sum([np.sum((Phi @ linear - tau) ** 2, axis=0) for Phi, _, tau in chunks], axis=0) / len(data.tau)
 
