@@ -315,12 +315,3 @@ def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> No
         raise InputError(f"{path} is not written: {error}") from None
     with writing(path) as partial, partial.open("wb") as file:
         np.savez_compressed(file, **arrays)
-
-
-def momenta(data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
-    """p and pd; raises `InputError` if the data have none."""
-    if data.p is None or data.pd is None:
-        raise InputError(
-            "a field is fitted to p and pd, which the data do not have; add them, or fit trajectories instead"
-        )
-    return data.p, data.pd

@@ -17,7 +17,7 @@ it is kept, in Phi_1; the others are Phi_2 = Phi_1 K, so that Phi theta = Phi_1 
 the ground come first. Within a body, mass, h_z and I_yy come last: these are the parameters usually regrouped.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import jax
@@ -26,6 +26,7 @@ from jaxtyping import Float, Int
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.linear import design, design_chunks, require_linear, unravelled
+from dln_jax.learning.posterior import Rows
 from dln_jax.mechanics.trees.inertia import PARAMETERS
 from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers.least_squares import scaled_columns
@@ -111,7 +112,7 @@ class Equations(NamedTuple):
     """N."""
 
 
-Regressor = Callable[[], Iterator[tuple[np.ndarray, np.ndarray]]]
+Regressor = Callable[[], Rows]
 """Starts a pass over the equations: yields Phi [n, d, P] and tau [n, d] of n samples at a time, computed anew."""
 
 
@@ -139,7 +140,7 @@ def regressor_of(
     with jax.enable_x64(True):
         at = unravelled(theta, parameters)
 
-    def passes() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def passes() -> Rows:
         with jax.enable_x64(True):
             for columns, predicted, tau in design_chunks(design(model), at, data, CHUNK):
                 require_linear(columns, theta, predicted)

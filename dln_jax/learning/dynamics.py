@@ -37,7 +37,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split
 from dln_jax.learning import objectives
 from dln_jax.learning.engine import optimisers
-from dln_jax.learning.engine.problem import Problem
+from dln_jax.learning.engine.problem import Problem, arrays_of
 from dln_jax.learning.objectives import TORQUE, Objective
 from dln_jax.learning.uncertainty import effective_samples
 from dln_jax.models.model import Model, Parameters, make_delan
@@ -162,7 +162,7 @@ def _shapes(model: Model) -> Parameters:
 def _read(model: Model, sets: Split, objective: Objective) -> tuple[Array, list[tuple[Array, ...]]]:
     """Returns the scale of the residuals, and the arrays of every set."""
     dtype = jnp.result_type(*jax.tree.leaves(_shapes(model)))
-    return objective.scale(sets.train).astype(dtype), [objectives.arrays(objective, data, dtype) for data in sets]
+    return objective.scale(sets.train).astype(dtype), [arrays_of(data, objective.keys, dtype) for data in sets]
 
 
 def _squares(objective: Objective, model: Model, parameters: Any, batch: tuple[Array, ...], scale: Array) -> Array:

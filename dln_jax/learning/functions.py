@@ -36,7 +36,7 @@ from dln_jax.learning.engine.problem import (
     silent,
     unmonitored,
 )
-from dln_jax.learning.select import Trial, select
+from dln_jax.learning.select import Selection, select
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers
@@ -182,7 +182,7 @@ def train(
     return training._replace(history=[mean(at) for at in training.history], best_step=int(np.max(training.best_step)))
 
 
-def grow_width(sets: SampleSplit, network: Network, fit: Callable[[Network], Training]) -> tuple[Trial, list[Trial]]:
+def grow_width(sets: SampleSplit, network: Network, fit: Callable[[Network], Training]) -> Selection:
     """Trains networks of `WIDTHS` with `fit` and chooses the smallest that no other beats significantly.
 
     The outcome of a trial is its `Training`. Errors are |r|² of validation samples, means over the ensemble's members.

@@ -25,7 +25,7 @@ from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
-from dln_jax.learning.select import Trial, lowest, select
+from dln_jax.learning.select import Selection, lowest, select
 from dln_jax.mechanics.friction import FrictionShape, coefficients_of, unit_force
 from dln_jax.models.joint_friction import FrictionParameters
 from dln_jax.models.kernel import KernelParameters, KernelScales, States, torque_covariance
@@ -128,9 +128,7 @@ def fit_kernel(
     )
 
 
-def choose_kernel(
-    needs: Needs, train: Trajectories, validation: Trajectories, *, samples: int = 600
-) -> tuple[Trial, list[Trial]]:
+def choose_kernel(needs: Needs, train: Trajectories, validation: Trajectories, *, samples: int = 600) -> Selection:
     """Fits a serial chain and a model without that assumption; returns the better in validation, and both trials.
 
     The candidate of a `Trial` is `serial`, its outcome the `KernelFit`; errors are relative to the joints' variances.

@@ -14,7 +14,7 @@ axis, ends at degree 0, which divides the size of the basis by 2 n + 1.
 import functools
 import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -24,12 +24,13 @@ from jax import Array
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
-from dln_jax.learning.select import Trial, select, significantly_better
+from dln_jax.learning.posterior import Rows
+from dln_jax.learning.select import Selection, Trial, select, significantly_better
 from dln_jax.models.model import Model, Parameters, linearised
 from dln_jax.precision import quick_compilation
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
-from dln_jax.types import InputError, Needs, SampleVector, require_positive
+from dln_jax.types import InputError, JointVector, Needs, SampleVector, require_positive
 from dln_jax.zoo.descriptions import make
 
 LARGEST_DEGREE = 4
@@ -95,13 +96,11 @@ def fit_linear(
         zero = np.zeros(count(like))
         linearise = design(model)  # one program for both passes
 
-        def equations() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-            for columns, _, tau in design_chunks(linearise, unravelled(zero, like), data, chunk_size):
-                weighted = columns / scale[:, None]
-                yield weighted.reshape(-1, zero.size), (tau / scale).ravel()
-
         solution = least_squares.solve_chunks(
-            equations(), ridge=ridge, rank_tolerance=rank_tolerance, negligible=negligible
+            weighted(design_chunks(linearise, unravelled(zero, like), data, chunk_size), scale),
+            ridge=ridge,
+            rank_tolerance=rank_tolerance,
+            negligible=negligible,
         )
         parameters = unravelled(solution.x, like)
         parts = (
@@ -113,7 +112,7 @@ def fit_linear(
         if not abs(np.linalg.norm(errors / scale) - solution.residual) <= np.linalg.norm(rounding / scale):
             raise InputError(_NOT_LINEAR)
     return LinearFit(
-        parameters=jax.tree.map(lambda leaf, shape: jnp.asarray(leaf, shape.dtype), parameters, like),
+        parameters=parameters_of(solution.x, like),
         parameter_count=zero.size,
         rank=solution.rank,
         condition=solution.condition,
@@ -145,6 +144,11 @@ def unravelled(vector: np.ndarray | Array, like: Parameters) -> Parameters:
     return jax.tree.unflatten(structure, parts)
 
 
+def parameters_of(vector: np.ndarray, like: Parameters) -> Parameters:
+    """Parameters of a model from a vector, in the dtypes of others."""
+    return jax.tree.map(lambda leaf, other: jnp.asarray(leaf, other.dtype), unravelled(vector, like), like)
+
+
 def design_chunks(
     linearise: Callable, parameters: Parameters, data: Trajectories, chunk_size: int, *, even: bool = True
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -162,7 +166,13 @@ def design_chunks(
         yield np.asarray(columns)[: last - first], np.asarray(tau)[: last - first], data.tau[first:last]
 
 
-def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) -> tuple[Trial, list[Trial]]:
+def weighted(chunks: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]], unit: JointVector) -> Rows:
+    """Yields rows [n d, P] and right-hand sides [n d] of `design_chunks`, in units of the joints."""
+    for columns, _, tau in chunks:
+        yield (columns / unit[:, None]).reshape(-1, columns.shape[2]), (tau / unit).ravel()
+
+
+def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) -> Selection:
     """Chooses the degree of every joint; returns the chosen trial and all trials.
 
     The candidate of a `Trial` is the degrees, and the outcome is the `LinearFit` in float64. Its errors are squared

@@ -16,7 +16,7 @@ the residuals of any other model, and `acceleration_misfit` compares models of o
 """
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -28,8 +28,9 @@ from jaxtyping import Float, Int
 from dln_jax.data.encoders.sampling import EVEN
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import segments
-from dln_jax.learning.linear import unravelled
+from dln_jax.learning.linear import parameters_of, unravelled
 from dln_jax.learning.objectives import torque_scale
+from dln_jax.learning.posterior import Rows
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model
@@ -57,7 +58,6 @@ class WeakFit(NamedTuple):
 
     parameters: Any
     """Parameters of the model, in its dtype."""
-    parameter_count: int
     rank: int
     condition: float
     errors: Float[np.ndarray, "W d"]
@@ -129,10 +129,7 @@ def fit_momentum(
         except np.linalg.LinAlgError:
             break  # exact data leave no errors
         solution, errors = solve(factor)
-    parameters = jax.tree.map(
-        lambda leaf, as_built: jnp.asarray(leaf, as_built.dtype), unravelled(solution.x, like), like
-    )
-    return WeakFit(parameters, solution.x.size, solution.rank, solution.condition, errors)
+    return WeakFit(parameters_of(solution.x, like), solution.rank, solution.condition, errors)
 
 
 def momentum_and_rest(plant: Dynamics, q: Vector, qd: Vector) -> tuple[Vector, Vector]:
@@ -178,9 +175,7 @@ def _cut(data: Trajectories, window: float) -> tuple[list[Int[np.ndarray, "W S+1
     return [own[:: max(1, steps // OVERLAP)] for own in windows], dt
 
 
-def _equations(
-    program: Callable[..., Array], data: Trajectories, window: float
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _equations(program: Callable[..., Array], data: Trajectories, window: float) -> Rows:
     """Columns [W, d, P] and right-hand sides [W, d] of windows, one chunk after the other."""
     pieces, dt = _cut(data, window)
     steps, d = pieces[0].shape[1] - 1, data.degrees_of_freedom

@@ -1,7 +1,7 @@
 """Objectives of training: the arrays that they read, the scales of their residuals, and the residuals of a sample."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -127,14 +127,6 @@ def objective_of(name: str, data: Trajectories, stated: str | None = None, *, to
     return torque if objective is TORQUE else objective
 
 
-def arrays(objective: Objective, data: Trajectories, dtype: Any) -> tuple[Array, ...]:
-    """Returns the arrays that an objective reads, on the device; `InputError` if one is missing or squares overflow."""
-    missing = [key for key in objective.keys if getattr(data, key) is None]
-    if missing:
-        raise InputError(f"the data have no {', '.join(missing)}, which this model is fitted to; add it to the file")
-    return arrays_of(data, objective.keys, dtype)
-
-
 def residuals(objective: Objective, system: System, batch: tuple[Array, ...]) -> Float[Array, "N r"]:
     """Residuals of a batch, in SI units."""
     return vmap(lambda *sample: objective.residual(system, *sample))(*batch)
@@ -144,7 +136,7 @@ def squared_torque_errors(model: Model, parameters: Parameters, data: Trajectori
     """Squared torque error of every sample and joint, computed in float64, in units of the squared scale."""
     with jax.enable_x64(True):
         judge = jax.jit(lambda theta, batch: residuals(TORQUE, model.energies(theta), batch))
-        errors = np.asarray(judge(parameters, arrays(TORQUE, data, jnp.float64)))
+        errors = np.asarray(judge(parameters, arrays_of(data, TORQUE.keys)))
     return (errors / scale) ** 2
 
 

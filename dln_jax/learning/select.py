@@ -43,6 +43,10 @@ class Trial(NamedTuple):
         return mean if np.isfinite(mean) else math.inf
 
 
+Selection = tuple[Trial, list[Trial]]
+"""The chosen trial, and all trials."""
+
+
 def significantly_better(errors: SampleVector, others: SampleVector, *, margin: float = 1.0) -> bool:
     """Whether `errors` are lower than `others` on average, by more than `margin` standard errors of the difference."""
     gain = others - errors
@@ -71,7 +75,7 @@ def select(
     patience: int | float = math.inf,
     until: float = math.inf,
     stop: Callable[[Trial], bool] = lambda trial: False,
-) -> tuple[Trial, list[Trial]]:
+) -> Selection:
     """Fits candidates in order; returns the chosen trial and all trials.
 
     Args:

@@ -22,13 +22,13 @@ from dln_jax.data.joints import needs_from_json
 from dln_jax.data.log import Log, Parts
 from dln_jax.data.schema import Trajectories
 from dln_jax.files import is_file, read_json, write_json
-from dln_jax.identification.identify import identify, parameters_of
+from dln_jax.identification.identify import identify
 from dln_jax.identification.rigid_tree import build_rigid_tree, describe_rigid_tree
 from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.learning.fit import Fit, direct_fit
 from dln_jax.learning.fits.direct import with_joint_laws
 from dln_jax.learning.fits.settings import Automatic, Kernel, LearnedTree, Network, Trigonometric
-from dln_jax.learning.linear import MOST_PARAMETERS, parameters_of_degree
+from dln_jax.learning.linear import MOST_PARAMETERS, parameters_of, parameters_of_degree
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
 from dln_jax.learning.select import Trial, lowest, mean_of_segments, say_selection, select, simplest
 from dln_jax.mechanics.equations import dynamics

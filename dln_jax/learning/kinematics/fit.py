@@ -1,7 +1,7 @@
 """Fits a tree of unknown kinematics to states and torques: search, refinement, and a final linear problem."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -24,7 +24,7 @@ from dln_jax.learning.kinematics.projection import (
     inertias_of,
 )
 from dln_jax.learning.kinematics.search import ALIKE, Search, Twin, count_agreeing, difference, search
-from dln_jax.learning.linear import design_chunks
+from dln_jax.learning.linear import design_chunks, weighted
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.models.trees import SerialTreeParameters, make_serial_tree
 from dln_jax.precision import quick_compilation
@@ -126,7 +126,8 @@ def fit_tree(
         def finished(descent: Descent) -> tuple[Descent, least_squares.LeastSquaresSolution, np.ndarray, np.ndarray]:
             """The refined descent, its linear solution, and its mean squared errors by joint on both sets."""
             state, unit = _refine(program, structure, descent, every, scale, settings)
-            solution = _solve(columns, state, unit, train, rank_tolerance)
+            rows = weighted(design_chunks(columns, state.frames, train, CHUNK), unit)
+            solution = least_squares.solve_chunks(rows, rank_tolerance=rank_tolerance, negligible=1e-12)
             trained, judged = (
                 _joint_errors(columns, state.frames, solution.x, part) for part in (train, validation or train)
             )
@@ -205,18 +206,6 @@ def _refine(
         if last < ROUNDS:
             unit = np.maximum(unit * np.sqrt(np.asarray(state.at.squares)), LEAST_NOISE * scale)
     return state, unit
-
-
-def _solve(
-    columns: Callable, state: Descent, unit: JointVector, data: Trajectories, rank_tolerance: float
-) -> least_squares.LeastSquaresSolution:
-    """Solves for the linear parameters of known frames on all data, by singular values."""
-
-    def equations() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for Phi, _, tau in design_chunks(columns, state.frames, data, CHUNK):
-            yield (Phi / unit[:, None]).reshape(-1, Phi.shape[-1]), (tau / unit).ravel()
-
-    return least_squares.solve_chunks(equations(), rank_tolerance=rank_tolerance, negligible=1e-12)
 
 
 def _joint_errors(columns: Callable, frames: Frames, linear: np.ndarray, data: Trajectories) -> JointVector:
