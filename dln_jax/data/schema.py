@@ -17,7 +17,7 @@ Samples of all trajectories are concatenated on axis 0.
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ from dln_jax.data.arrays import load_file, numeric, unread_line
 from dln_jax.data.joints import (
     OPTIONAL,
     PER_JOINT,
+    TorqueFactor,
     match_names,
     needs_from_text,
     scale_torques,
@@ -91,7 +92,7 @@ def load(
     units: str | None = None,
     joints: Sequence[str] = (),
     topics: Sequence[str] = (),
-    torque_factor: float | int | Sequence[float | int] | Mapping[str, float | int] | None = None,
+    torque_factor: TorqueFactor | None = None,
     robot: Sequence[str] = (),
     repair: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
 ) -> Trajectories:

@@ -3,7 +3,6 @@
 Splits are by trajectory, never by sample, since neighbouring samples of a trajectory are almost copies.
 """
 
-import hashlib
 import re
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -95,7 +94,7 @@ def segments(t: SampleVector, trajectory: SampleIndex, *, gap: float = GAP) -> l
     return pieces
 
 
-def window_indices(data: Trajectories, length: int, *, gap: float = GAP) -> tuple[np.ndarray, np.ndarray]:
+def window_indices(data: Trajectories, length: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample indices [W, T] of consecutive windows, which share their end samples, and the weights of the samples.
 
     Windows lie within segments. The rest of a segment is a shorter window, padded with its last sample at weight 0.
@@ -107,7 +106,7 @@ def window_indices(data: Trajectories, length: int, *, gap: float = GAP) -> tupl
         raise InputError(f"length is {length}; expected a window of at least 2 samples")
     pieces = [
         segment[first : first + length]
-        for segment in segments(data.t, data.trajectory, gap=gap)
+        for segment in segments(data.t, data.trajectory)
         for first in range(0, len(segment) - 1, length - 1)
     ]
     if not pieces:
@@ -272,11 +271,11 @@ def held_out(count: int, share: float, what: str) -> int:
 def require_no_copies(seen: Trajectories, test: Trajectories) -> None:
     """Raises `InputError` if a test trajectory is a copy of a training one; motionless ones are not compared."""
 
-    def contents(data: Trajectories) -> dict[bytes, int]:
+    def contents(data: Trajectories) -> dict[int, int]:
         states = np.hstack([data.q, data.qd, data.qdd, data.tau])
         first = np.flatnonzero(np.diff(data.trajectory, prepend=-1))
         motions = zip(data.trajectory[first].tolist(), np.split(states, first[1:]), strict=True)
-        return {hashlib.sha256(part.tobytes()).digest(): index for index, part in motions if np.ptp(part, axis=0).any()}
+        return {hash(part.tobytes()): index for index, part in motions if np.ptp(part, axis=0).any()}
 
     known = contents(seen)
     for content, index in contents(test).items():

@@ -19,7 +19,7 @@ from dln_jax.learning import dynamics
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import arrays_of
-from dln_jax.learning.objectives import SCALED_TORQUE, residuals, squared_torque_errors
+from dln_jax.learning.objectives import SCALED_TORQUE, residuals, squared_torque_errors, torque_scale
 from dln_jax.learning.select import mean_of_segments, select
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.residual import ResidualParameters, frozen, make_residual, make_with_residual
@@ -79,7 +79,7 @@ def fit_residual(
         InputError: the torques do not vary.
     """
     with jax.enable_x64(True):
-        scale = np.asarray(SCALED_TORQUE.scale(train))
+        scale = torque_scale(train)
         batch = arrays_of(train, SCALED_TORQUE.keys)
         unexplained = jax.jit(lambda: residuals(SCALED_TORQUE, rigid.energies(parameters), batch))()
         magnitudes = {"torque_scale": unexplained, "rate_scale": train.qd, "acceleration_scale": train.qdd}

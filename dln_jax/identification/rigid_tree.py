@@ -44,7 +44,7 @@ from dln_jax.mechanics.trees.description import Tree, tree_to_json
 from dln_jax.mechanics.trees.motors import Pair
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.trees import Rows
-from dln_jax.precision import quick_compilation
+from dln_jax.precision import compiled
 from dln_jax.types import FrictionLaw, JointSamples, Needs
 from dln_jax.zoo.descriptions import Description, build, describe
 
@@ -203,7 +203,7 @@ def at_reference(
         there, here = (dynamics(energies(parameters, at)).friction(q, qd) for at in (temperature, reference))
         return there - here
 
-    change = jax.jit(jax.vmap(warmer), compiler_options=quick_compilation())
+    change = compiled(jax.vmap(warmer))
     with jax.enable_x64(True):
         return [log._replace(tau=log.tau - np.asarray(change(log.q, log.qd, log.temperature))) for log in logs]
 

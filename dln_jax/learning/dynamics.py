@@ -38,6 +38,7 @@ from dln_jax.data.splits import Split
 from dln_jax.learning import objectives
 from dln_jax.learning.engine import optimisers
 from dln_jax.learning.engine.problem import Problem, arrays_of
+from dln_jax.learning.linear import shapes_of
 from dln_jax.learning.objectives import TORQUE, Objective
 from dln_jax.learning.uncertainty import effective_samples
 from dln_jax.models.model import Model, Parameters, make_delan
@@ -96,7 +97,7 @@ def validation_errors(model: Model, sets: Split, parameters: Parameters, objecti
 
 def suited_optimiser(model: Model, sets: Split, objective: Objective = TORQUE) -> tuple[str, str]:
     """Returns the name of the optimiser that suits the sizes of the model and the data, and the reason."""
-    return optimisers.suited(_shapes(model), len(sets.train.t), len(objective.scale(sets.train)))
+    return optimisers.suited(shapes_of(model), len(sets.train.t), len(objective.scale(sets.train)))
 
 
 class Suited(NamedTuple):
@@ -117,7 +118,7 @@ def suited_network(needs: Needs, train: Trajectories) -> Suited:
     """Returns the settings for an arm of many joints, from its needs and the information in the training motions."""
     d = needs.degrees_of_freedom
     small = {"width": WIDTH, "depth": 1, "shared_trunk": True}
-    size = count(_shapes(make_delan(needs, **small)))
+    size = count(shapes_of(make_delan(needs, **small)))
     independent = independent_equations(train)
     reason = f"{independent:,} independent equations for the {size:,} parameters of a small network"
     if independent > MOST_INDEPENDENT * size:
@@ -155,17 +156,13 @@ def without_offset(needs: Needs) -> Needs:
     return needs._replace(joint_friction=tuple(law for law in needs.joint_friction if law != "offset"))
 
 
-def _shapes(model: Model) -> Parameters:
-    return jax.eval_shape(model.init, jax.random.key(0))
-
-
-def _read(model: Model, sets: Split, objective: Objective) -> tuple[Array, list[tuple[Array, ...]]]:
+def _read(model: Model, sets: Split, objective: Objective) -> tuple[np.ndarray, list[tuple[Array, ...]]]:
     """Returns the scale of the residuals, and the arrays of every set."""
-    dtype = jnp.result_type(*jax.tree.leaves(_shapes(model)))
+    dtype = jnp.result_type(*jax.tree.leaves(shapes_of(model)))
     return objective.scale(sets.train).astype(dtype), [arrays_of(data, objective.keys, dtype) for data in sets]
 
 
-def _squares(objective: Objective, model: Model, parameters: Any, batch: tuple[Array, ...], scale: Array) -> Array:
+def _squares(objective: Objective, model: Model, parameters: Any, batch: tuple[Array, ...], scale: np.ndarray) -> Array:
     """Squared error of every sample of a batch, in the units of the validation error."""
     errors = objectives.residuals(objective, model.energies(parameters), batch)
     return jnp.sum((errors if objective.selects_by == "torque" else errors / scale) ** 2, axis=1)

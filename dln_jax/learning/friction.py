@@ -31,7 +31,7 @@ from dln_jax.mechanics.trees.motors import Pair, motor_regressor
 from dln_jax.mechanics.trees.recursions import regressor
 from dln_jax.models.model import Model
 from dln_jax.models.trees import WARM, RigidTreeParameters, Rows, make_rigid_tree
-from dln_jax.precision import quick_compilation
+from dln_jax.precision import compiled
 from dln_jax.solvers.separable import SeparableSolution, solve_separable
 from dln_jax.types import FrictionLaw, InputError, JointVector
 
@@ -113,7 +113,7 @@ def known_of(tree: Tree, data: Trajectories, terms: Terms, *, noise: Any = None)
     bare, (laws, shape, _, cooling, motors, coupled) = tree._replace(armature=np.zeros(d)), terms
     # A model refuses wrong terms.
     make_rigid_tree(bare, friction=laws, cooling=float(cooling), motors=motors, coupled=coupled, **shape._asdict())
-    weights = np.asarray(torque_scale(data) if noise is None else np.broadcast_to(noise, d), float)
+    weights = torque_scale(data) if noise is None else np.broadcast_to(noise, d).astype(float)
     if not (np.isfinite(weights) & (weights > 0)).all():
         raise InputError(f"noise is {noise}; expected a positive number, or one for each joint")
 
@@ -127,7 +127,7 @@ def known_of(tree: Tree, data: Trajectories, terms: Terms, *, noise: Any = None)
         reference = reference_temperature(data)  # refuses data without temperature
         warmth = jnp.asarray(data.temperature) - reference
     return Known(
-        links=jax.jit(jax.vmap(columns), compiler_options=quick_compilation())(*state),
+        links=compiled(jax.vmap(columns))(*state),
         rates=joint_rates(motors, state[1].T).T,
         warmth=warmth,
         tau=tau,

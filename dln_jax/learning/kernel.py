@@ -29,7 +29,7 @@ from dln_jax.learning.select import Selection, lowest, select
 from dln_jax.mechanics.friction import FrictionShape, coefficients_of, unit_force
 from dln_jax.models.joint_friction import FrictionParameters
 from dln_jax.models.kernel import KernelParameters, KernelScales, States, torque_covariance
-from dln_jax.precision import quick_compilation
+from dln_jax.precision import compiled
 from dln_jax.types import InputError, JointKind, JointSamples, JointVector, Needs, SampleVector, require_positive
 from dln_jax.zoo.descriptions import make
 
@@ -101,7 +101,7 @@ def fit_kernel(
         raise InputError(f"the needs have {needs.degrees_of_freedom} joints, the data {train.degrees_of_freedom}")
     began = time.perf_counter()
     with jax.enable_x64(True):
-        unit = np.asarray(torque_scale(train))
+        unit = torque_scale(train)
         columns = _friction(needs, train.qd)
         # S of a coefficient: 1 / (RMS torque of one unit of it, relative to the torques' deviations).
         sizes = np.sqrt(np.mean(np.sum((columns / unit[:, None]) ** 2, axis=1), axis=0))
@@ -134,8 +134,7 @@ def choose_kernel(needs: Needs, train: Trajectories, validation: Trajectories, *
     The candidate of a `Trial` is `serial`, its outcome the `KernelFit`; errors are relative to the joints' variances.
     Raises as `fit_kernel`.
     """
-    with jax.enable_x64(True):
-        scale = np.asarray(torque_scale(train))
+    scale = torque_scale(train)
 
     def fit(serial: bool) -> tuple[KernelFit, SampleVector]:
         solution = fit_kernel(needs, train, samples=samples, serial=serial)
@@ -205,7 +204,7 @@ def _likeliest(
 
     first = start_of(needs, serial, equations, unit), np.log(FIRST_NOISE * unit)
     start, unknowns_of = ravel_pytree(first)
-    evaluate = jax.jit(likelihood(needs.joints, serial), compiler_options=quick_compilation())
+    evaluate = compiled(likelihood(needs.joints, serial))
 
     def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
         value, slopes = evaluate(unknowns_of(jnp.asarray(x)), equations)
@@ -274,4 +273,4 @@ def start_of(needs: Needs, serial: bool, equations: TorqueEquations, unit: np.nd
 @functools.lru_cache(maxsize=4)
 def compiled_covariance(joints: tuple[JointKind, ...], serial: bool) -> Callable[..., Any]:
     """(scales, states) -> `torque_covariance`."""
-    return jax.jit(functools.partial(torque_covariance, joints, serial), compiler_options=quick_compilation())
+    return compiled(functools.partial(torque_covariance, joints, serial))

@@ -27,7 +27,7 @@ from dln_jax.learning.objectives import squared_torque_errors, torque_scale
 from dln_jax.learning.posterior import Rows
 from dln_jax.learning.select import Selection, Trial, select, significantly_better
 from dln_jax.models.model import Model, Parameters, linearised
-from dln_jax.precision import quick_compilation
+from dln_jax.precision import compiled
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
 from dln_jax.types import InputError, JointVector, Needs, SampleVector, require_positive
@@ -90,9 +90,9 @@ def fit_linear(
     """
     require_positive(chunk_size=chunk_size)
     start = time.perf_counter()
-    like = jax.eval_shape(model.init, jax.random.key(0))
+    like = shapes_of(model)
     with jax.enable_x64(True):
-        scale = np.asarray(torque_scale(data))
+        scale = torque_scale(data)
         zero = np.zeros(count(like))
         linearise = design(model)  # one program for both passes
 
@@ -125,7 +125,7 @@ def fit_linear(
 def design(model: Model) -> Callable:
     """(parameters, q, qd, qdd as [N, d]) -> Phi [N, d, P] and tau [N, d]: `linearised`, compiled."""
     one = functools.partial(linearised, model)
-    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
+    return compiled(jax.vmap(one, in_axes=(None, 0, 0, 0)))
 
 
 def require_linear(columns: np.ndarray, theta: np.ndarray, predicted: np.ndarray) -> np.ndarray:
@@ -134,6 +134,11 @@ def require_linear(columns: np.ndarray, theta: np.ndarray, predicted: np.ndarray
     if not (abs(columns @ theta - predicted) <= rounding).all():
         raise InputError(_NOT_LINEAR)
     return rounding
+
+
+def shapes_of(model: Model) -> Parameters:
+    """The parameters of a model as shapes and dtypes."""
+    return jax.eval_shape(model.init, jax.random.key(0))
 
 
 def unravelled(vector: np.ndarray | Array, like: Parameters) -> Parameters:
@@ -183,7 +188,7 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
         InputError: the basis of degree 1 is too large, or `fit_linear` refuses the data.
     """
     d = needs.degrees_of_freedom
-    scale = np.asarray(torque_scale(train))
+    scale = torque_scale(train)
     target = ROUNDING**2 * float(np.mean(np.sum((validation.tau / scale) ** 2, axis=1)))
 
     def fit(degrees: tuple[int, ...]) -> tuple[LinearFit, SampleVector]:
@@ -215,4 +220,4 @@ def parameters_of_degree(needs: Needs, degree: int) -> int | None:
         model = make("trigonometric", needs, degree=degree)
     except InputError:
         return None
-    return count(jax.eval_shape(model.init, jax.random.key(0)))
+    return count(shapes_of(model))

@@ -25,6 +25,7 @@ from dln_jax.data.arrays import spread
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select_samples
 from dln_jax.learning.engine.problem import Problem, Progress, Stop, Training, arrays_of, selected_by
+from dln_jax.learning.linear import shapes_of
 from dln_jax.learning.objectives import TORQUE
 from dln_jax.learning.shooting import Gauge, check_gauge, gauge_error
 from dln_jax.mechanics.equations import dynamics, flow
@@ -81,7 +82,7 @@ def match_linear(
     """
     began = time.perf_counter()
     with jax.enable_x64(True):
-        zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), jax.eval_shape(model.init, jax.random.key(0)))
+        zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes_of(model))
         columns = jax.jit(jax.jacrev(lambda c, *sample: rate_residual(model, c, *sample)))
         arrays = arrays_of(data, PHASE)
         design = np.asarray(jax.jit(jax.vmap(columns, in_axes=(None, 0, 0, 0, 0)))(zero, *arrays))

@@ -23,7 +23,7 @@ class Objective(NamedTuple):
 
     keys: tuple[str, ...]
     """Arrays [N, d] of `Trajectories` that the residual reads."""
-    scale: Callable[[Trajectories], Float[Array, " r"]]
+    scale: Callable[[Trajectories], np.ndarray]
     """Training data -> the scales of the residuals. Raises InputError if the data cannot determine the model."""
     residual: Callable[..., Float[Array, " r"]]
     """(system, *sample) -> residuals of one sample, in SI units."""
@@ -37,7 +37,7 @@ class Objective(NamedTuple):
         return self.residual is TORQUE.residual
 
 
-def torque_scale(data: Trajectories) -> Float[Array, " d"]:
+def torque_scale(data: Trajectories) -> JointVector:
     """Standard deviations of the torques [d], in N m or N: the scales of the residuals.
 
     A channel that does not vary (a joint without a motor) is scaled by the root mean square of those that do.
@@ -64,10 +64,10 @@ SCALED_TORQUE = TORQUE._replace(selects_by="scaled")
 """The same residual; validation errors are in units of the joints' `torque_scale`."""
 
 
-def _canonical_scale(data: Trajectories) -> Float[Array, " two_d"]:
+def _canonical_scale(data: Trajectories) -> np.ndarray:
     torque_scale(data)
     still = "is constant in every training sample: nothing moves, and no Hamiltonian can be told from another"
-    return jnp.concatenate([_scale(key, getattr(data, key), f"{key} {still}") for key in ("qd", "qdd")])
+    return np.concatenate([_scale(key, getattr(data, key), f"{key} {still}") for key in ("qd", "qdd")])
 
 
 def _canonical_residual(system: Energies, q: Vector, qd: Vector, qdd: Vector, p: Vector, tau: Vector) -> Array:
@@ -86,9 +86,9 @@ The published loss uses dp/dt of the data instead of qdd. In the published arm d
 with a mean square error of 8e-6 (N m)², while q, qd, qdd and tau are consistent to rounding."""
 
 
-def _both_scales(data: Trajectories) -> Float[Array, " two_d"]:
+def _both_scales(data: Trajectories) -> np.ndarray:
     still = "qdd is constant in every training sample; add trajectories that accelerate"
-    return jnp.concatenate([torque_scale(data), _scale("qdd", data.qdd, still)])
+    return np.concatenate([torque_scale(data), _scale("qdd", data.qdd, still)])
 
 
 FORWARD = SCALED_TORQUE._replace(
@@ -140,7 +140,7 @@ def squared_torque_errors(model: Model, parameters: Parameters, data: Trajectori
     return (errors / scale) ** 2
 
 
-def _scale(name: str, array: np.ndarray, message: str) -> Float[Array, " d"]:
+def _scale(name: str, array: np.ndarray, message: str) -> JointVector:
     """Standard deviations of the columns; a column that does not vary gets the root mean square of the others."""
     deviation = spread(name, array)
     # Rounding leaves a constant channel with a deviation of about 1e-17 of the numbers that it was computed from.
@@ -148,4 +148,4 @@ def _scale(name: str, array: np.ndarray, message: str) -> Float[Array, " d"]:
     if not varies.any():
         raise InputError(message)
     typical = (deviation[varies] ** 2).mean() ** 0.5
-    return jnp.asarray([size if moves else typical for size, moves in zip(deviation, varies, strict=True)])
+    return np.where(varies, deviation, typical)

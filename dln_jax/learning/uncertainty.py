@@ -102,7 +102,7 @@ def estimate(
     if ridge is not None and not 0 <= ridge < np.inf:
         raise InputError(f"ridge is {ridge}; expected a number >= 0, or None to choose it by validation")
     with jax.enable_x64(True):
-        spread = np.asarray(torque_scale(train), np.float64)
+        spread = torque_scale(train)
         unit = spread if unit is None else np.asarray(unit, np.float64)
         parameters = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), parameters)
         if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(parameters)):

@@ -28,7 +28,7 @@ from dln_jax.identification.equations import NEGLIGIBLE
 from dln_jax.identification.excitation.limits import Clearance, Excess, MotionLimits, beyond, require_limits
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters, linearised
-from dln_jax.precision import quick_compilation, require_double_precision
+from dln_jax.precision import compiled, require_double_precision
 from dln_jax.solvers.least_squares import scaled_columns
 from dln_jax.types import InputError, JointVector, require_positive, require_seed
 
@@ -177,7 +177,7 @@ def make_task(
         )
         return Phi, tau, excess
 
-    samples = jax.jit(jax.vmap(observe), compiler_options=quick_compilation())
+    samples = compiled(jax.vmap(observe))
     random, steps, seen = np.random.default_rng(seed), SAMPLES * harmonics, []
     for _ in range(-(-STATES // steps)):
         q = random.uniform(limits.position[:, 0], limits.position[:, 1], (steps, d))

@@ -104,7 +104,7 @@ def compare(
     Raises:
         InputError: torques that do not vary, or no candidate that could be fitted.
     """
-    scale, rows, ended = np.asarray(torque_scale(train)), {}, ""
+    scale, rows, ended = torque_scale(train), {}, ""
     share = (noise / scale) ** 2
 
     def attempt(name: str, candidate: Callable[[], Any]) -> tuple[Any, np.ndarray | None]:

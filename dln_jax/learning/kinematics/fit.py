@@ -18,16 +18,16 @@ from dln_jax.learning.kinematics.projection import (
     Program,
     Samples,
     Structure,
-    compiled,
     descend,
     design,
     inertias_of,
+    make_program,
 )
 from dln_jax.learning.kinematics.search import ALIKE, Search, Twin, count_agreeing, difference, search
 from dln_jax.learning.linear import design_chunks, weighted
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.models.trees import SerialTreeParameters, make_serial_tree
-from dln_jax.precision import quick_compilation
+from dln_jax.precision import compiled
 from dln_jax.solvers import least_squares
 from dln_jax.types import InputError, JointVector, Needs, require_positive
 
@@ -117,8 +117,8 @@ def fit_tree(
     acceleration = acceleration if needs.gravity else 0.0
     structure = Structure(order, needs.joints, acceleration, needs.friction, velocity_scale)
     with jax.enable_x64(True):
-        scale = np.asarray(torque_scale(train))
-        program, columns = compiled(structure, ridge=ridge), _columns(structure)
+        scale = torque_scale(train)
+        program, columns = make_program(structure, ridge=ridge), _columns(structure)
         parts = [drawn(train, count, settings.seed) for count in (settings.samples, most_samples)]
         some, every = ((part.q, part.qd, part.qdd, part.tau) for part in parts)
         searched, twin, until, wanted = ([], 0), None, began + settings.seconds, settings
@@ -219,7 +219,7 @@ def _columns(structure: Structure) -> Callable:
     def one(frames: Frames, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
         return design(structure, frames, q, qd, qdd), jnp.zeros_like(q)
 
-    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
+    return compiled(jax.vmap(one, in_axes=(None, 0, 0, 0)))
 
 
 def _parameters(structure: Structure, frames: Frames, linear: np.ndarray) -> SerialTreeParameters:
