@@ -22,13 +22,19 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from dln_jax.errors import InputError as InputError
 
 Scalar = Float[Array, ""]
 Vector = Float[Array, "d"]
 Matrix = Float[Array, "d d"]
+JointVector = Float[np.ndarray, " d"]
+"""A number for each joint."""
+JointSamples = Float[np.ndarray, "N d"]
+SampleVector = Float[np.ndarray, " N"]
+SampleIndex = Int[np.ndarray, " N"]
+"""An index for each sample, such as that of its trajectory."""
 
 VectorLike = ArrayLike | Sequence[ArrayLike]
 """Accepted types of a vector argument: an array, or a list or tuple of numbers."""

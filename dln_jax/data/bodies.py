@@ -9,7 +9,8 @@ the wrong columns mix axes and do not vanish, so an order that the file does not
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+
+from dln_jax.types import JointSamples
 
 Order = Literal["bodies", "axes"]
 """"bodies" is x1, y1, x2, y2; "axes" is x1, x2, y1, y2."""
@@ -28,7 +29,7 @@ class Bodies(NamedTuple):
     order: Order
 
 
-def imbalance(forces: Float[np.ndarray, "N d"], bodies: Bodies) -> float:
+def imbalance(forces: JointSamples, bodies: Bodies) -> float:
     """How far the forces are from summing to zero along every axis: 0 if balanced, about 1 by chance."""
     size = np.sqrt(np.mean(forces**2))
     if not size > 0:
@@ -46,7 +47,7 @@ def arrangements(d: int) -> list[Bodies]:
     return [Bodies(axes, order) for axes in (2, 3) if d % axes == 0 and d >= 2 * axes for order in ORDERS]
 
 
-def find_bodies(forces: Float[np.ndarray, "N d"], *, order: Order | None = None) -> Bodies | None:
+def find_bodies(forces: JointSamples, *, order: Order | None = None) -> Bodies | None:
     """The only arrangement in which the forces on the bodies balance, or `None` unless there is exactly one.
 
     With a known `order` only the dimension is determined, as the one that balances best.

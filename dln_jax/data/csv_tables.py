@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from dln_jax.data.arrays import UNREAD
 from dln_jax.files import write_bytes
-from dln_jax.types import InputError, JointKind
+from dln_jax.types import InputError, JointKind, JointSamples, SampleVector
 
 MOST_BYTES = 2**30
 """Largest file read; larger data are faster and smaller as npz."""
@@ -262,9 +261,9 @@ def _number(text: str) -> float | None:
 
 def write_motion(
     path: Path,
-    t: Float[np.ndarray, " N"],
-    q: Float[np.ndarray, "N d"],
-    qd: Float[np.ndarray, "N d"],
+    t: SampleVector,
+    q: JointSamples,
+    qd: JointSamples,
     *,
     names: tuple[str, ...],
     joints: tuple[JointKind, ...],

@@ -20,6 +20,10 @@ PER_JOINT = ("q", *OPTIONAL, "temperature")
 """Keys of arrays with one column per joint."""
 
 
+TorqueFactor = float | int | Sequence[float | int] | Mapping[str, float | int]
+"""Factors of tau: one, one for each joint, or by name."""
+
+
 def select_names(own: Sequence[str], stated: Sequence[str]) -> dict[str, str]:
     """New names of the joints of a log that a user states, by their names in the log and in the stated order.
 
@@ -109,9 +113,7 @@ def _by_prefix(own: Sequence[str], wanted: Sequence[str]) -> list[dict[str, str]
     return options
 
 
-def scale_torques(
-    arrays: dict[str, Any], stated: float | int | Sequence[float | int] | Mapping[str, float | int] | None
-) -> dict[str, Any]:
+def scale_torques(arrays: dict[str, Any], stated: TorqueFactor | None) -> dict[str, Any]:
     """Multiplies tau by one factor, one per joint, or factors by name (1 for other joints).
 
     Raises:

@@ -1,16 +1,16 @@
 """Reads a log and all that is known of it (joints, robot, filter, findings of the check), and splits it into parts."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from dln_jax.data import schema
 from dln_jax.data.checks.channels import Finding
 from dln_jax.data.checks.report import quick
 from dln_jax.data.encoders.smoothing import Smoothed, labels_of_parts, smooth
+from dln_jax.data.joints import TorqueFactor
 from dln_jax.data.repeated_motions import motion_numbers, remark_on_repeats
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
@@ -27,7 +27,7 @@ from dln_jax.data.splits import (
 )
 from dln_jax.mechanics.friction import USUAL
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.types import InputError, Needs
+from dln_jax.types import InputError, JointVector, Needs
 
 NO_GRAVITY = "no-gravity"
 """Check for torques from which a robot's controller has subtracted gravity."""
@@ -87,7 +87,7 @@ class Log(NamedTuple):
         return f"torques low-passed at {self.smoothed.cutoff:.3g} Hz (measured ones scatter more)"
 
     @property
-    def torque_noise(self) -> Float[np.ndarray, " d"] | None:
+    def torque_noise(self) -> JointVector | None:
         """Standard deviation of the noise of filtered torques, N m or N; `None` if they are not filtered."""
         return None if self.smoothed is None or not self.smoothed.filtered_torque else self.smoothed.noise_tau
 
@@ -100,7 +100,7 @@ def read_log(
     units: Literal["si", "degrees"] | None = None,
     joints: Sequence[str] = (),
     topics: Sequence[str] = (),
-    torque_factor: float | Sequence[float] | Mapping[str, float] | None = None,
+    torque_factor: TorqueFactor | None = None,
     **known: Any,
 ) -> Log:
     """Reads, filters and checks a log: npz, CSV or a ROS bag.
@@ -181,7 +181,14 @@ def log_of(
         )
     if not driven and np.any(data.tau):
         raise InputError(f"{name} has applied forces tau, unlike free motions; train it by train_hnn --data {name}")
-    needs, origin = (needs, needs_origin) if needs is not None else known_needs(data, robot, assume)
+    origin = needs_origin
+    if needs is None and data.needs is not None:
+        needs, origin = data.needs, "the data file"
+    elif needs is None and robot is not None:
+        needs, origin = robot.tree.needs._replace(joint_friction=USUAL), "the robot's file, and friction"
+    elif needs is None:
+        unknown = Needs(joints=("revolute",) * data.degrees_of_freedom, joint_friction=USUAL)
+        needs, origin = unknown if assume is None else assume(data), ASSUMED
     if needs.degrees_of_freedom != data.degrees_of_freedom:
         raise InputError(
             f"{origin} has {needs.degrees_of_freedom} joints, but {name} has {data.degrees_of_freedom}; make them agree"
@@ -224,19 +231,6 @@ def log_of(
         smoothed=smoothed,
         measured=data,
     )
-
-
-def known_needs(
-    data: Trajectories, robot: Robot | None, assume: Callable[[Trajectories], Needs] | None = None
-) -> tuple[Needs, str]:
-    """Joints and terms of a plant that nobody states, and where they come from."""
-    if data.needs is not None:
-        return data.needs, "the data file"
-    if robot is not None:
-        return robot.tree.needs._replace(joint_friction=USUAL), "the robot's file, and friction"
-    if assume is not None:
-        return assume(data), ASSUMED
-    return Needs(joints=("revolute",) * data.degrees_of_freedom, joint_friction=USUAL), ASSUMED
 
 
 def preparation(data: Trajectories, smoothed: Smoothed | None) -> list[str]:

@@ -11,10 +11,11 @@ other's, at whatever time: it may start later, or show a part of the motion.
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from scipy.spatial import KDTree
 
 from dln_jax.data.schema import Trajectories
+from dln_jax.types import JointSamples, SampleIndex
 
 TIMES, DURATION = 5, 0.3
 """Number of embedded times, and the time that they span as a share of the shortest recording."""
@@ -30,7 +31,7 @@ SHORTEST, MOST = 50, 300
 """Fewest samples of a recording that is compared, and the largest number of recordings."""
 
 
-def motion_numbers(q: Float[np.ndarray, "N d"], trajectory: Int[np.ndarray, " N"]) -> Int[np.ndarray, " T"]:
+def motion_numbers(q: JointSamples, trajectory: SampleIndex) -> Int[np.ndarray, " T"]:
     """Returns the number of the motion that each trajectory shows, by the trajectory's index.
 
     Motions are numbered by their first trajectories; absent trajectories have -1. Motionless and short trajectories,

@@ -25,7 +25,7 @@ from dln_jax.data.robot_xml import (
 )
 from dln_jax.mechanics.trees.description import Tree, make_tree
 from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
-from dln_jax.types import InputError
+from dln_jax.types import InputError, JointVector
 
 INSTALL = "pip install 'dln-jax[robot]'"
 Lock = Mapping[str, float] | Sequence[str]
@@ -42,9 +42,9 @@ class Robot(NamedTuple):
     """A tree and the other joint data of its file; limits that are not stated are infinite, friction zero."""
 
     tree: Tree
-    damping: Float[np.ndarray, " d"]
+    damping: JointVector
     """Viscous friction, N m s or N s/m."""
-    coulomb: Float[np.ndarray, " d"]
+    coulomb: JointVector
     """Dry friction, N m or N."""
     position_limits: Float[np.ndarray, "d 2"]
     """rad or m."""

@@ -17,7 +17,7 @@ Samples of all trajectories are concatenated on axis 0.
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ from dln_jax.data.arrays import load_file, numeric, unread_line
 from dln_jax.data.joints import (
     OPTIONAL,
     PER_JOINT,
+    TorqueFactor,
     match_names,
     needs_from_text,
     scale_torques,
@@ -91,7 +92,7 @@ def load(
     units: str | None = None,
     joints: Sequence[str] = (),
     topics: Sequence[str] = (),
-    torque_factor: float | int | Sequence[float | int] | Mapping[str, float | int] | None = None,
+    torque_factor: TorqueFactor | None = None,
     robot: Sequence[str] = (),
     repair: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
 ) -> Trajectories:
@@ -315,12 +316,3 @@ def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> No
         raise InputError(f"{path} is not written: {error}") from None
     with writing(path) as partial, partial.open("wb") as file:
         np.savez_compressed(file, **arrays)
-
-
-def momenta(data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
-    """p and pd; raises `InputError` if the data have none."""
-    if data.p is None or data.pd is None:
-        raise InputError(
-            "a field is fitted to p and pd, which the data do not have; add them, or fit trajectories instead"
-        )
-    return data.p, data.pd

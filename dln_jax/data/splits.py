@@ -3,17 +3,16 @@
 Splits are by trajectory, never by sample, since neighbouring samples of a trajectory are almost copies.
 """
 
-import hashlib
 import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from dln_jax.data.joints import PER_JOINT, match_names
 from dln_jax.data.schema import Trajectories
-from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.types import InputError, SampleIndex, SampleVector, require_positive, require_seed
 
 PER_SAMPLE = ("t", "trajectory", *PER_JOINT)
 LEAST_TRAJECTORIES = 3
@@ -77,9 +76,7 @@ def with_joints(data: Trajectories, names: Sequence[str]) -> Trajectories:
     return data._replace(**columns, joint_names=np.array(names), needs=needs, remarks=tuple(remarks))
 
 
-def segments(
-    t: Float[np.ndarray, " N"], trajectory: Int[np.ndarray, " N"], *, gap: float = GAP
-) -> list[Int[np.ndarray, " n"]]:
+def segments(t: SampleVector, trajectory: SampleIndex, *, gap: float = GAP) -> list[Int[np.ndarray, " n"]]:
     """Sample indices of the segments of all trajectories, cut at steps longer than `gap` times the median step.
 
     Raises:
@@ -97,7 +94,7 @@ def segments(
     return pieces
 
 
-def window_indices(data: Trajectories, length: int, *, gap: float = GAP) -> tuple[np.ndarray, np.ndarray]:
+def window_indices(data: Trajectories, length: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample indices [W, T] of consecutive windows, which share their end samples, and the weights of the samples.
 
     Windows lie within segments. The rest of a segment is a shorter window, padded with its last sample at weight 0.
@@ -109,7 +106,7 @@ def window_indices(data: Trajectories, length: int, *, gap: float = GAP) -> tupl
         raise InputError(f"length is {length}; expected a window of at least 2 samples")
     pieces = [
         segment[first : first + length]
-        for segment in segments(data.t, data.trajectory, gap=gap)
+        for segment in segments(data.t, data.trajectory)
         for first in range(0, len(segment) - 1, length - 1)
     ]
     if not pieces:
@@ -274,11 +271,11 @@ def held_out(count: int, share: float, what: str) -> int:
 def require_no_copies(seen: Trajectories, test: Trajectories) -> None:
     """Raises `InputError` if a test trajectory is a copy of a training one; motionless ones are not compared."""
 
-    def contents(data: Trajectories) -> dict[bytes, int]:
+    def contents(data: Trajectories) -> dict[int, int]:
         states = np.hstack([data.q, data.qd, data.qdd, data.tau])
         first = np.flatnonzero(np.diff(data.trajectory, prepend=-1))
         motions = zip(data.trajectory[first].tolist(), np.split(states, first[1:]), strict=True)
-        return {hashlib.sha256(part.tobytes()).digest(): index for index, part in motions if np.ptp(part, axis=0).any()}
+        return {hash(part.tobytes()): index for index, part in motions if np.ptp(part, axis=0).any()}
 
     known = contents(seen)
     for content, index in contents(test).items():

@@ -17,7 +17,7 @@ it is kept, in Phi_1; the others are Phi_2 = Phi_1 K, so that Phi theta = Phi_1 
 the ground come first. Within a body, mass, h_z and I_yy come last: these are the parameters usually regrouped.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import jax
@@ -26,13 +26,13 @@ from jaxtyping import Float, Int
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.linear import design, design_chunks, require_linear, unravelled
+from dln_jax.learning.posterior import Rows
 from dln_jax.mechanics.trees.inertia import PARAMETERS
 from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers.least_squares import scaled_columns
-from dln_jax.types import InputError
+from dln_jax.types import InputError, JointSamples, JointVector
 
 ParameterVector = Float[np.ndarray, " P"]
-JointVector = Float[np.ndarray, " d"]
 Kind = Literal["inertia", "positive", "signed", "coupling"]
 Determinacy = Literal["alone", "in combination", "not at all"]
 PREFERRED = ("I_zz", "h_x", "h_y", "I_xx", "I_xy", "I_xz", "I_yz", "I_yy", "h_z", "m")
@@ -112,7 +112,7 @@ class Equations(NamedTuple):
     """N."""
 
 
-Regressor = Callable[[], Iterator[tuple[np.ndarray, np.ndarray]]]
+Regressor = Callable[[], Rows]
 """Starts a pass over the equations: yields Phi [n, d, P] and tau [n, d] of n samples at a time, computed anew."""
 
 
@@ -140,7 +140,7 @@ def regressor_of(
     with jax.enable_x64(True):
         at = unravelled(theta, parameters)
 
-    def passes() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def passes() -> Rows:
         with jax.enable_x64(True):
             for columns, predicted, tau in design_chunks(design(model), at, data, CHUNK):
                 require_linear(columns, theta, predicted)
@@ -149,7 +149,7 @@ def regressor_of(
     return passes
 
 
-def compress(regressor: Regressor, weights: Float[np.ndarray, "N d"] | None = None) -> Equations:
+def compress(regressor: Regressor, weights: JointSamples | None = None) -> Equations:
     """Compresses the equations to triangular factors, with rows scaled by the square root of `weights`, if any."""
     triangles, samples = None, 0
     for columns, tau in regressor():
@@ -174,7 +174,7 @@ def squares(equations: Equations, theta: ParameterVector) -> JointVector:
     return np.sum((equations.triangles @ np.append(theta, -1.0)) ** 2, axis=1)
 
 
-def residuals(regressor: Regressor, theta: ParameterVector) -> Float[np.ndarray, "N d"]:
+def residuals(regressor: Regressor, theta: ParameterVector) -> JointSamples:
     """tau - Phi theta of every sample."""
     return np.concatenate([tau - columns @ theta for columns, tau in regressor()])
 

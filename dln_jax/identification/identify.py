@@ -3,8 +3,6 @@ report: base parameters, all parameters, and findings about the data."""
 
 from typing import Any, NamedTuple, get_args
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.data.schema import Trajectories, from_arrays
@@ -14,7 +12,6 @@ from dln_jax.identification.equations import (
     BaseParameters,
     Columns,
     Determinacy,
-    JointVector,
     ParameterVector,
     columns_of,
     compress,
@@ -22,9 +19,8 @@ from dln_jax.identification.equations import (
     regressor_of,
 )
 from dln_jax.identification.weighted import ROUNDING, WeightedFit, correlation_times, fit_robust, fit_weighted
-from dln_jax.learning.linear import unravelled
 from dln_jax.models.model import Model, Parameters
-from dln_jax.types import InputError, JointKind
+from dln_jax.types import InputError, JointKind, JointVector
 
 STATES = 40
 """Number of random states per joint for computing the structure."""
@@ -141,11 +137,6 @@ def seen_by(fit: WeightedFit, base: BaseParameters, structure: tuple[Determinacy
         else "in combination"
         for share, before in zip(shares.tolist(), structure, strict=True)
     )  # fmt: skip
-
-
-def parameters_of(theta: ParameterVector, like: Parameters) -> Parameters:
-    """Parameters of the model from a vector in the order of its columns."""
-    return jax.tree.map(jnp.asarray, unravelled(theta, like))
 
 
 def random_states(joints: tuple[JointKind, ...], samples: int, seed: int) -> Trajectories:

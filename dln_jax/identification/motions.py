@@ -29,13 +29,13 @@ from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.identification.consistent import fit_consistent
-from dln_jax.identification.equations import Columns, JointVector, ParameterVector
-from dln_jax.learning.linear import unravelled
+from dln_jax.identification.equations import Columns, ParameterVector
+from dln_jax.learning.linear import shapes_of, unravelled
 from dln_jax.learning.shooting import MeasuredWindows, cut_measured_windows, motion, without_start
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model
-from dln_jax.precision import quick_compilation
-from dln_jax.types import InputError, require_positive
+from dln_jax.precision import compiled
+from dln_jax.types import InputError, JointVector, require_positive
 
 ROUNDS, SETTLED = 12, 1e-4
 """Largest number of linearisations, and the smallest relative decrease of the sum that continues them."""
@@ -84,7 +84,7 @@ def linearise(model: Model) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     The last unknown is the delay, in units of `TYPICAL_DELAY`; the derivatives are [W, T d + d, P + 1]. Residuals are
     those of the nearest starts.
     """
-    like = jax.eval_shape(model.init, jax.random.key(0))
+    like = shapes_of(model)
 
     def one(unknowns: Array, noise_q: Array, noise_tau: Array, window: tuple[Array, ...]) -> tuple[Array, Array]:
         t, q, qd, tau, weight, slope = window
@@ -102,7 +102,7 @@ def linearise(model: Model) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
         return left, left
 
     with_slopes = jax.vmap(jax.jacfwd(one, has_aux=True), in_axes=(None, None, None, 0))
-    every = jax.jit(with_slopes, compiler_options=quick_compilation())
+    every = compiled(with_slopes)
 
     def linearised(unknowns, noise_q, noise_tau, windows: MeasuredWindows, slope) -> tuple[np.ndarray, np.ndarray]:
         count, parts = len(windows.t), []
@@ -120,13 +120,13 @@ def linearise(model: Model) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
 @functools.lru_cache(maxsize=4)
 def _damping(model: Model) -> Callable[..., Array]:
     """(theta [P], q [n, d], qd [n, d], tau [n, d]) -> d qdd / d qd [n, d, d]."""
-    like = jax.eval_shape(model.init, jax.random.key(0))
+    like = shapes_of(model)
 
     def slopes(theta: Array, *state: Array) -> Array:
         forward_dynamics = dynamics(model.energies(unravelled(theta, like))).forward_dynamics
         return jax.jacfwd(forward_dynamics, argnums=1)(*state)
 
-    return jax.jit(jax.vmap(slopes, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
+    return compiled(jax.vmap(slopes, in_axes=(None, 0, 0, 0)))
 
 
 def _require_resolved(model: Model, theta: ParameterVector, windows: MeasuredWindows) -> None:

@@ -5,12 +5,9 @@ error on validation motions is lower by more than the standard error of the diff
 segments of time assumed to be independent, since neighbouring samples are not.
 """
 
-import math
-import time
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -21,27 +18,21 @@ from dln_jax.data.splits import select as trajectories
 from dln_jax.learning import dynamics
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.learning.objectives import SCALED_TORQUE, arrays, residuals, squared_torque_errors
-from dln_jax.learning.select import Trial, mean_of_segments, select
+from dln_jax.learning.engine.problem import arrays_of
+from dln_jax.learning.objectives import SCALED_TORQUE, residuals, squared_torque_errors, torque_scale
+from dln_jax.learning.select import mean_of_segments, select
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.residual import ResidualParameters, frozen, make_residual, make_with_residual
 from dln_jax.types import InputError, Needs, ResidualTerm
 
-
-class Candidate(NamedTuple):
-    """Size of a network; no terms means no network."""
-
-    terms: tuple[ResidualTerm, ...] = ()
-    width: int = 0
-
-
-CANDIDATES = (
-    Candidate(),
-    Candidate(("dissipation",), 4),
-    Candidate(("potential", "dissipation"), 4),
-    Candidate(("potential", "dissipation"), 8),
-    Candidate(("potential", "dissipation", "inertia"), 8),
-    Candidate(("potential", "dissipation"), 16),
+Candidate = tuple[tuple[ResidualTerm, ...], int]
+"""Terms and width of a network."""
+CANDIDATES: tuple[Candidate, ...] = (
+    (("dissipation",), 4),
+    (("potential", "dissipation"), 4),
+    (("potential", "dissipation"), 8),
+    (("potential", "dissipation", "inertia"), 8),
+    (("potential", "dissipation"), 16),
 )
 
 
@@ -60,11 +51,8 @@ class ResidualFit(NamedTuple):
     """The tree's own model, or the sum."""
     parameters: Parameters
     """Parameters of the tree, or `ResidualParameters`."""
-    chosen: Candidate
     settings: dict[str, Any]
     """Keywords of `make_residual`; empty if no network was selected."""
-    trials: list[Trial]
-    """All candidates tried, with errors per segment of validation motion in units of the torque's spread."""
 
 
 def fit_residual(
@@ -76,7 +64,6 @@ def fit_residual(
     *,
     candidates: tuple[Candidate, ...] = CANDIDATES,
     iterations: int = 40,
-    seconds: float = math.inf,
 ) -> ResidualFit:
     """Fits residual networks to the torques unexplained by an identified tree, and selects the smallest sufficient one.
 
@@ -85,19 +72,15 @@ def fit_residual(
         parameters: identified parameters, which stay fixed.
         train: data that the tree was identified from.
         validation: other motions, used for selection; judge the result on yet others.
-        candidates: candidates in order of size, the first without terms.
+        candidates: networks in order of size; every one has to improve on those before it, and the first on none.
         iterations: upper limit of Gauss-Newton iterations; the parameters with the lowest validation error are kept.
-        seconds: time limit; then the current network stops training, and no other one is tried.
 
     Raises:
-        InputError: the first candidate has terms, or the torques do not vary.
+        InputError: the torques do not vary.
     """
-    if not candidates or candidates[0].terms:
-        raise InputError("candidates start with a network; the first must be none, which the others have to improve on")
-    until = time.perf_counter() + seconds
     with jax.enable_x64(True):
-        scale = np.asarray(SCALED_TORQUE.scale(train))
-        batch = arrays(SCALED_TORQUE, train, jnp.float64)
+        scale = torque_scale(train)
+        batch = arrays_of(train, SCALED_TORQUE.keys)
         unexplained = jax.jit(lambda: residuals(SCALED_TORQUE, rigid.energies(parameters), batch))()
         magnitudes = {"torque_scale": unexplained, "rate_scale": train.qd, "acceleration_scale": train.qdd}
         sizes = {
@@ -105,20 +88,15 @@ def fit_residual(
             for name, values in magnitudes.items()
         }
 
-        def errors(model: Model, parameters: Parameters) -> Float[np.ndarray, " segments"]:
-            squares = squared_torque_errors(model, parameters, validation, scale)
-            return mean_of_segments(validation, np.sum(squares, axis=1))
+        def attempt(candidate: Candidate | None) -> tuple[ResidualFit, Float[np.ndarray, " segments"]]:
+            model, whole, settings = rigid, parameters, {}
+            if candidate is not None:
+                terms, width = candidate
+                settings = {"terms": terms, "width": width, **sizes}
+                model = make_with_residual(rigid, make_residual(needs, **settings))
+                own = dynamics.problem(frozen(model, parameters), Split(train, validation, validation), SCALED_TORQUE)
+                whole = ResidualParameters(parameters, fit(own, GaussNewton(steps=iterations)).parameters)
+            squares = squared_torque_errors(model, whole, validation, scale)
+            return ResidualFit(model, whole, settings), mean_of_segments(validation, np.sum(squares, axis=1))
 
-        def attempt(candidate: Candidate) -> tuple[Any, Float[np.ndarray, " segments"]]:
-            if not candidate.terms:
-                return None, errors(rigid, parameters)
-            settings = {**candidate._asdict(), **sizes}
-            both = make_with_residual(rigid, make_residual(needs, **settings))
-            problem = dynamics.problem(frozen(both, parameters), Split(train, validation, validation), SCALED_TORQUE)
-            training = fit(problem, GaussNewton(steps=iterations), seconds=max(until - time.perf_counter(), 1e-9))
-            whole = ResidualParameters(parameters, training.parameters)
-            return (both, whole, settings), errors(both, whole)
-
-        chosen, trials = select(candidates, attempt, patience=2, until=until)
-    model, whole, settings = (rigid, parameters, {}) if chosen.outcome is None else chosen.outcome
-    return ResidualFit(model, whole, chosen.candidate, settings, trials)
+        return select((None, *candidates), attempt, patience=2)[0].outcome

@@ -44,8 +44,8 @@ from dln_jax.mechanics.trees.description import Tree, tree_to_json
 from dln_jax.mechanics.trees.motors import Pair
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.trees import Rows
-from dln_jax.precision import quick_compilation
-from dln_jax.types import FrictionLaw, Needs
+from dln_jax.precision import compiled
+from dln_jax.types import FrictionLaw, JointSamples, Needs
 from dln_jax.zoo.descriptions import Description, build, describe
 
 MOST_SAMPLES, FEWER_SAMPLES = 4_000, 2_000
@@ -203,12 +203,12 @@ def at_reference(
         there, here = (dynamics(energies(parameters, at)).friction(q, qd) for at in (temperature, reference))
         return there - here
 
-    change = jax.jit(jax.vmap(warmer), compiler_options=quick_compilation())
+    change = compiled(jax.vmap(warmer))
     with jax.enable_x64(True):
         return [log._replace(tau=log.tau - np.asarray(change(log.q, log.qd, log.temperature))) for log in logs]
 
 
-def shared_motor(left: Float[np.ndarray, "N d"], qd: Float[np.ndarray, "N d"]) -> tuple[int, int, float, float] | None:
+def shared_motor(left: JointSamples, qd: JointSamples) -> tuple[int, int, float, float] | None:
     """Returns j, i (from 0), c and the share of the motor that explains most; `None` if none explains enough."""
     from scipy.linalg import block_diag  # imported here, after commands have set BLAS's threads
 

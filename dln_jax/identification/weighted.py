@@ -16,7 +16,6 @@ from jaxtyping import Float
 from dln_jax.identification.equations import (
     NEGLIGIBLE,
     Equations,
-    JointVector,
     ParameterVector,
     Regressor,
     compress,
@@ -25,7 +24,7 @@ from dln_jax.identification.equations import (
     whiten,
 )
 from dln_jax.solvers.least_squares import scaled_columns
-from dln_jax.types import InputError
+from dln_jax.types import InputError, JointSamples, JointVector
 
 ROUNDING = 1e-10
 """Singular values below this fraction of the largest are rounding errors of dependent columns."""
@@ -139,7 +138,7 @@ def _solve(
     return fit, np.sum(by_joint[:, :, :rank] ** 2, axis=(1, 2))
 
 
-def correlation_times(errors: Float[np.ndarray, "N d"], trajectory: np.ndarray) -> JointVector:
+def correlation_times(errors: JointSamples, trajectory: np.ndarray) -> JointVector:
     """Correlation time of every joint's residuals in samples; 1 for independent ones.
 
     1 + 2 sum of autocorrelations within trajectories, up to the first pair of lags whose sum is not positive (Geyer
@@ -158,7 +157,7 @@ def correlation_times(errors: Float[np.ndarray, "N d"], trajectory: np.ndarray) 
     return np.maximum(2 * np.sum(np.where(ended, 0.0, pairs), axis=0) - 1, 1.0)  # the pairs include lag 0, which is 1
 
 
-def fit_robust(regressor: Regressor, known: ParameterVector) -> tuple[WeightedFit, Float[np.ndarray, "N d"]]:
+def fit_robust(regressor: Regressor, known: ParameterVector) -> tuple[WeightedFit, JointSamples]:
     """Huber's estimate: the loss grows linearly instead of quadratically beyond `THRESHOLD` times the noise.
 
     Iteratively reweighted least squares with weights min(1, threshold noise / |error|), returned with the fit; the

@@ -32,18 +32,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split
 from dln_jax.learning import objectives
 from dln_jax.learning.engine import optimisers
-from dln_jax.learning.engine.problem import Problem
+from dln_jax.learning.engine.problem import Problem, arrays_of
+from dln_jax.learning.linear import shapes_of
 from dln_jax.learning.objectives import TORQUE, Objective
 from dln_jax.learning.uncertainty import effective_samples
 from dln_jax.models.model import Model, Parameters, make_delan
 from dln_jax.solvers.normal_equations import count
-from dln_jax.types import Needs, require_seed
+from dln_jax.types import Needs, SampleVector, require_seed
 
 MANY_JOINTS = 4
 """Arms with fewer joints get a small network and all their samples."""
@@ -89,9 +89,7 @@ def problem(model: Model, sets: Split, objective: Objective = TORQUE, *, seeds: 
     return Problem(residual, initial(numbers), fitted, score, numbers)
 
 
-def validation_errors(
-    model: Model, sets: Split, parameters: Parameters, objective: Objective = TORQUE
-) -> Float[np.ndarray, " N"]:
+def validation_errors(model: Model, sets: Split, parameters: Parameters, objective: Objective = TORQUE) -> SampleVector:
     """Squared error of every validation sample; their mean selects the parameters."""
     scale, (_, batch, _) = _read(model, sets, objective)
     return np.asarray(jax.jit(lambda theta: _squares(objective, model, theta, batch, scale))(parameters))
@@ -99,7 +97,7 @@ def validation_errors(
 
 def suited_optimiser(model: Model, sets: Split, objective: Objective = TORQUE) -> tuple[str, str]:
     """Returns the name of the optimiser that suits the sizes of the model and the data, and the reason."""
-    return optimisers.suited(_shapes(model), len(sets.train.t), len(objective.scale(sets.train)))
+    return optimisers.suited(shapes_of(model), len(sets.train.t), len(objective.scale(sets.train)))
 
 
 class Suited(NamedTuple):
@@ -120,7 +118,7 @@ def suited_network(needs: Needs, train: Trajectories) -> Suited:
     """Returns the settings for an arm of many joints, from its needs and the information in the training motions."""
     d = needs.degrees_of_freedom
     small = {"width": WIDTH, "depth": 1, "shared_trunk": True}
-    size = count(_shapes(make_delan(needs, **small)))
+    size = count(shapes_of(make_delan(needs, **small)))
     independent = independent_equations(train)
     reason = f"{independent:,} independent equations for the {size:,} parameters of a small network"
     if independent > MOST_INDEPENDENT * size:
@@ -158,17 +156,13 @@ def without_offset(needs: Needs) -> Needs:
     return needs._replace(joint_friction=tuple(law for law in needs.joint_friction if law != "offset"))
 
 
-def _shapes(model: Model) -> Parameters:
-    return jax.eval_shape(model.init, jax.random.key(0))
-
-
-def _read(model: Model, sets: Split, objective: Objective) -> tuple[Array, list[tuple[Array, ...]]]:
+def _read(model: Model, sets: Split, objective: Objective) -> tuple[np.ndarray, list[tuple[Array, ...]]]:
     """Returns the scale of the residuals, and the arrays of every set."""
-    dtype = jnp.result_type(*jax.tree.leaves(_shapes(model)))
-    return objective.scale(sets.train).astype(dtype), [objectives.arrays(objective, data, dtype) for data in sets]
+    dtype = jnp.result_type(*jax.tree.leaves(shapes_of(model)))
+    return objective.scale(sets.train).astype(dtype), [arrays_of(data, objective.keys, dtype) for data in sets]
 
 
-def _squares(objective: Objective, model: Model, parameters: Any, batch: tuple[Array, ...], scale: Array) -> Array:
+def _squares(objective: Objective, model: Model, parameters: Any, batch: tuple[Array, ...], scale: np.ndarray) -> Array:
     """Squared error of every sample of a batch, in the units of the validation error."""
     errors = objectives.residuals(objective, model.energies(parameters), batch)
     return jnp.sum((errors if objective.selects_by == "torque" else errors / scale) ** 2, axis=1)

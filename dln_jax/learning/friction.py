@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.engine.problem import arrays_of
@@ -32,9 +31,9 @@ from dln_jax.mechanics.trees.motors import Pair, motor_regressor
 from dln_jax.mechanics.trees.recursions import regressor
 from dln_jax.models.model import Model
 from dln_jax.models.trees import WARM, RigidTreeParameters, Rows, make_rigid_tree
-from dln_jax.precision import quick_compilation
+from dln_jax.precision import compiled
 from dln_jax.solvers.separable import SeparableSolution, solve_separable
-from dln_jax.types import FrictionLaw, InputError
+from dln_jax.types import FrictionLaw, InputError, JointVector
 
 FIRST_LOAD = 0.05
 LONGEST_STEP = 1.0
@@ -114,7 +113,7 @@ def known_of(tree: Tree, data: Trajectories, terms: Terms, *, noise: Any = None)
     bare, (laws, shape, _, cooling, motors, coupled) = tree._replace(armature=np.zeros(d)), terms
     # A model refuses wrong terms.
     make_rigid_tree(bare, friction=laws, cooling=float(cooling), motors=motors, coupled=coupled, **shape._asdict())
-    weights = np.asarray(torque_scale(data) if noise is None else np.broadcast_to(noise, d), float)
+    weights = torque_scale(data) if noise is None else np.broadcast_to(noise, d).astype(float)
     if not (np.isfinite(weights) & (weights > 0)).all():
         raise InputError(f"noise is {noise}; expected a positive number, or one for each joint")
 
@@ -128,7 +127,7 @@ def known_of(tree: Tree, data: Trajectories, terms: Terms, *, noise: Any = None)
         reference = reference_temperature(data)  # refuses data without temperature
         warmth = jnp.asarray(data.temperature) - reference
     return Known(
-        links=jax.jit(jax.vmap(columns), compiler_options=quick_compilation())(*state),
+        links=compiled(jax.vmap(columns))(*state),
         rates=joint_rates(motors, state[1].T).T,
         warmth=warmth,
         tau=tau,
@@ -212,9 +211,9 @@ class FrictionFit(NamedTuple):
     parameters: RigidTreeParameters
     standard_errors: RigidTreeParameters
     """Standard error of every parameter, in its unit, within the space that the data determine."""
-    shape: dict[str, Float[np.ndarray, " d"]]
+    shape: dict[str, JointVector]
     """Fitted entries of `FrictionShape`, "load", and "cooling" (k, 1/K)."""
-    shape_errors: dict[str, Float[np.ndarray, " d"]]
+    shape_errors: dict[str, JointVector]
     """Standard errors of the entries of `shape`, in their units."""
     keywords: dict[str, Any]
     """Keywords of `make_rigid_tree` for the model, without its laws: shapes, motors, and with cooling the reference

@@ -36,12 +36,12 @@ from dln_jax.learning.engine.problem import (
     silent,
     unmonitored,
 )
-from dln_jax.learning.select import Trial, select
+from dln_jax.learning.select import Selection, select
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers
 from dln_jax.precision import data_type
-from dln_jax.types import InputError, Scalar, require_positive, require_seed
+from dln_jax.types import InputError, SampleVector, Scalar, require_positive, require_seed
 
 LOSSES = ("type1", "type2")
 MISSING = {
@@ -182,7 +182,7 @@ def train(
     return training._replace(history=[mean(at) for at in training.history], best_step=int(np.max(training.best_step)))
 
 
-def grow_width(sets: SampleSplit, network: Network, fit: Callable[[Network], Training]) -> tuple[Trial, list[Trial]]:
+def grow_width(sets: SampleSplit, network: Network, fit: Callable[[Network], Training]) -> Selection:
     """Trains networks of `WIDTHS` with `fit` and chooses the smallest that no other beats significantly.
 
     The outcome of a trial is its `Training`. Errors are |r|² of validation samples, means over the ensemble's members.
@@ -196,7 +196,7 @@ def grow_width(sets: SampleSplit, network: Network, fit: Callable[[Network], Tra
         errors = jax.vmap(lambda member: of_sample(member, *sample))(layers)
         return jnp.mean(jnp.sum(errors**2, axis=1))
 
-    def fit_and_judge(candidate: Network) -> tuple[Training, Float[np.ndarray, " N"]]:
+    def fit_and_judge(candidate: Network) -> tuple[Training, SampleVector]:
         training = fit(candidate)
         return training, np.asarray(squares(training.parameters, held_out))
 

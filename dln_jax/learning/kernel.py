@@ -25,12 +25,12 @@ from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
-from dln_jax.learning.select import Trial, lowest, select
+from dln_jax.learning.select import Selection, lowest, select
 from dln_jax.mechanics.friction import FrictionShape, coefficients_of, unit_force
 from dln_jax.models.joint_friction import FrictionParameters
 from dln_jax.models.kernel import KernelParameters, KernelScales, States, torque_covariance
-from dln_jax.precision import quick_compilation
-from dln_jax.types import InputError, JointKind, Needs, require_positive
+from dln_jax.precision import compiled
+from dln_jax.types import InputError, JointKind, JointSamples, JointVector, Needs, SampleVector, require_positive
 from dln_jax.zoo.descriptions import make
 
 NOISIER = 3.0
@@ -54,7 +54,7 @@ class KernelFit(NamedTuple):
 
     parameters: Any
     """Parameters of the catalogue's `trigonometric-kernel`, in float64, for `samples` samples."""
-    noise: Float[np.ndarray, " d"]
+    noise: JointVector
     """Standard deviation of the torque noise in the equations, N m or N, including torque that no such energy explains.
     It exceeds the most likely value if rounding would otherwise make the covariance indefinite."""
     likelihood: float
@@ -101,7 +101,7 @@ def fit_kernel(
         raise InputError(f"the needs have {needs.degrees_of_freedom} joints, the data {train.degrees_of_freedom}")
     began = time.perf_counter()
     with jax.enable_x64(True):
-        unit = np.asarray(torque_scale(train))
+        unit = torque_scale(train)
         columns = _friction(needs, train.qd)
         # S of a coefficient: 1 / (RMS torque of one unit of it, relative to the torques' deviations).
         sizes = np.sqrt(np.mean(np.sum((columns / unit[:, None]) ** 2, axis=1), axis=0))
@@ -128,18 +128,15 @@ def fit_kernel(
     )
 
 
-def choose_kernel(
-    needs: Needs, train: Trajectories, validation: Trajectories, *, samples: int = 600
-) -> tuple[Trial, list[Trial]]:
+def choose_kernel(needs: Needs, train: Trajectories, validation: Trajectories, *, samples: int = 600) -> Selection:
     """Fits a serial chain and a model without that assumption; returns the better in validation, and both trials.
 
     The candidate of a `Trial` is `serial`, its outcome the `KernelFit`; errors are relative to the joints' variances.
     Raises as `fit_kernel`.
     """
-    with jax.enable_x64(True):
-        scale = np.asarray(torque_scale(train))
+    scale = torque_scale(train)
 
-    def fit(serial: bool) -> tuple[KernelFit, Float[np.ndarray, " N"]]:
+    def fit(serial: bool) -> tuple[KernelFit, SampleVector]:
         solution = fit_kernel(needs, train, samples=samples, serial=serial)
         model = make("trigonometric-kernel", needs, samples=solution.samples, serial=serial)
         errors = squared_torque_errors(model, solution.parameters, validation, scale)
@@ -148,9 +145,7 @@ def choose_kernel(
     return select((True, False), fit, rule=lowest)
 
 
-def _factor(
-    covariance: Float[np.ndarray, "Nd Nd"], noise: Float[np.ndarray, " d"], unit: Float[np.ndarray, " d"]
-) -> tuple[Any, Float[np.ndarray, " d"]]:
+def _factor(covariance: Float[np.ndarray, "Nd Nd"], noise: JointVector, unit: JointVector) -> tuple[Any, JointVector]:
     """Returns the Cholesky factor of the covariance with noise, and the noise, raised as far as rounding requires."""
     from scipy.linalg import cho_factor
 
@@ -167,7 +162,7 @@ def _factor(
     )
 
 
-def _friction(needs: Needs, qd: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N d P"]:
+def _friction(needs: Needs, qd: JointSamples) -> Float[np.ndarray, "N d P"]:
     """Torques of one unit of every friction coefficient."""
     d = needs.degrees_of_freedom
     if "load" in needs.joint_friction:
@@ -209,7 +204,7 @@ def _likeliest(
 
     first = start_of(needs, serial, equations, unit), np.log(FIRST_NOISE * unit)
     start, unknowns_of = ravel_pytree(first)
-    evaluate = jax.jit(likelihood(needs.joints, serial), compiler_options=quick_compilation())
+    evaluate = compiled(likelihood(needs.joints, serial))
 
     def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
         value, slopes = evaluate(unknowns_of(jnp.asarray(x)), equations)
@@ -278,4 +273,4 @@ def start_of(needs: Needs, serial: bool, equations: TorqueEquations, unit: np.nd
 @functools.lru_cache(maxsize=4)
 def compiled_covariance(joints: tuple[JointKind, ...], serial: bool) -> Callable[..., Any]:
     """(scales, states) -> `torque_covariance`."""
-    return jax.jit(functools.partial(torque_covariance, joints, serial), compiler_options=quick_compilation())
+    return compiled(functools.partial(torque_covariance, joints, serial))

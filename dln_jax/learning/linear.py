@@ -14,23 +14,23 @@ axis, ends at degree 0, which divides the size of the basis by 2 n + 1.
 import functools
 import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
-from dln_jax.learning.select import Trial, select, significantly_better
+from dln_jax.learning.posterior import Rows
+from dln_jax.learning.select import Selection, Trial, select, significantly_better
 from dln_jax.models.model import Model, Parameters, linearised
-from dln_jax.precision import quick_compilation
+from dln_jax.precision import compiled
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
-from dln_jax.types import InputError, Needs, require_positive
+from dln_jax.types import InputError, JointVector, Needs, SampleVector, require_positive
 from dln_jax.zoo.descriptions import make
 
 LARGEST_DEGREE = 4
@@ -90,19 +90,17 @@ def fit_linear(
     """
     require_positive(chunk_size=chunk_size)
     start = time.perf_counter()
-    like = jax.eval_shape(model.init, jax.random.key(0))
+    like = shapes_of(model)
     with jax.enable_x64(True):
-        scale = np.asarray(torque_scale(data))
+        scale = torque_scale(data)
         zero = np.zeros(count(like))
         linearise = design(model)  # one program for both passes
 
-        def equations() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-            for columns, _, tau in design_chunks(linearise, unravelled(zero, like), data, chunk_size):
-                weighted = columns / scale[:, None]
-                yield weighted.reshape(-1, zero.size), (tau / scale).ravel()
-
         solution = least_squares.solve_chunks(
-            equations(), ridge=ridge, rank_tolerance=rank_tolerance, negligible=negligible
+            weighted(design_chunks(linearise, unravelled(zero, like), data, chunk_size), scale),
+            ridge=ridge,
+            rank_tolerance=rank_tolerance,
+            negligible=negligible,
         )
         parameters = unravelled(solution.x, like)
         parts = (
@@ -114,7 +112,7 @@ def fit_linear(
         if not abs(np.linalg.norm(errors / scale) - solution.residual) <= np.linalg.norm(rounding / scale):
             raise InputError(_NOT_LINEAR)
     return LinearFit(
-        parameters=jax.tree.map(lambda leaf, shape: jnp.asarray(leaf, shape.dtype), parameters, like),
+        parameters=parameters_of(solution.x, like),
         parameter_count=zero.size,
         rank=solution.rank,
         condition=solution.condition,
@@ -127,7 +125,7 @@ def fit_linear(
 def design(model: Model) -> Callable:
     """(parameters, q, qd, qdd as [N, d]) -> Phi [N, d, P] and tau [N, d]: `linearised`, compiled."""
     one = functools.partial(linearised, model)
-    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
+    return compiled(jax.vmap(one, in_axes=(None, 0, 0, 0)))
 
 
 def require_linear(columns: np.ndarray, theta: np.ndarray, predicted: np.ndarray) -> np.ndarray:
@@ -138,12 +136,22 @@ def require_linear(columns: np.ndarray, theta: np.ndarray, predicted: np.ndarray
     return rounding
 
 
+def shapes_of(model: Model) -> Parameters:
+    """The parameters of a model as shapes and dtypes."""
+    return jax.eval_shape(model.init, jax.random.key(0))
+
+
 def unravelled(vector: np.ndarray | Array, like: Parameters) -> Parameters:
     """Returns a tree like another from a vector, in the order of its leaves; nothing is compiled."""
     leaves, structure = jax.tree.flatten(like)
     ends = np.cumsum([leaf.size for leaf in leaves])
     parts = (vector[end - leaf.size : end].reshape(leaf.shape) for leaf, end in zip(leaves, ends, strict=True))
     return jax.tree.unflatten(structure, parts)
+
+
+def parameters_of(vector: np.ndarray, like: Parameters) -> Parameters:
+    """Parameters of a model from a vector, in the dtypes of others."""
+    return jax.tree.map(lambda leaf, other: jnp.asarray(leaf, other.dtype), unravelled(vector, like), like)
 
 
 def design_chunks(
@@ -163,7 +171,13 @@ def design_chunks(
         yield np.asarray(columns)[: last - first], np.asarray(tau)[: last - first], data.tau[first:last]
 
 
-def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) -> tuple[Trial, list[Trial]]:
+def weighted(chunks: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]], unit: JointVector) -> Rows:
+    """Yields rows [n d, P] and right-hand sides [n d] of `design_chunks`, in units of the joints."""
+    for columns, _, tau in chunks:
+        yield (columns / unit[:, None]).reshape(-1, columns.shape[2]), (tau / unit).ravel()
+
+
+def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) -> Selection:
     """Chooses the degree of every joint; returns the chosen trial and all trials.
 
     The candidate of a `Trial` is the degrees, and the outcome is the `LinearFit` in float64. Its errors are squared
@@ -174,10 +188,10 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
         InputError: the basis of degree 1 is too large, or `fit_linear` refuses the data.
     """
     d = needs.degrees_of_freedom
-    scale = np.asarray(torque_scale(train))
+    scale = torque_scale(train)
     target = ROUNDING**2 * float(np.mean(np.sum((validation.tau / scale) ** 2, axis=1)))
 
-    def fit(degrees: tuple[int, ...]) -> tuple[LinearFit, Float[np.ndarray, " N"]]:
+    def fit(degrees: tuple[int, ...]) -> tuple[LinearFit, SampleVector]:
         with jax.enable_x64(True):
             model = make("trigonometric", needs, degree=degrees)
             solution = fit_linear(model, train)
@@ -206,4 +220,4 @@ def parameters_of_degree(needs: Needs, degree: int) -> int | None:
         model = make("trigonometric", needs, degree=degree)
     except InputError:
         return None
-    return count(jax.eval_shape(model.init, jax.random.key(0)))
+    return count(shapes_of(model))

@@ -15,24 +15,25 @@ first fit for `learning.shooting`, whose result does not depend on estimated der
 import functools
 import math
 import time
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
 
-from dln_jax.data.arrays import on_device, spread
-from dln_jax.data.schema import Trajectories, momenta
+from dln_jax.data.arrays import spread
+from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select_samples
 from dln_jax.learning.engine.problem import Problem, Progress, Stop, Training, arrays_of, selected_by
+from dln_jax.learning.linear import shapes_of
 from dln_jax.learning.objectives import TORQUE
 from dln_jax.learning.shooting import Gauge, check_gauge, gauge_error
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers import least_squares
-from dln_jax.types import require_positive, require_seed
+from dln_jax.types import SampleVector, require_positive, require_seed
+
+PHASE = ("q", "p", "qd", "pd")
 
 
 def rate_residual(model: Model, parameters: Parameters, q: Array, p: Array, qd: Array, pd: Array) -> Array:
@@ -60,16 +61,18 @@ def rates_problem(
     require_seed(seed)
     parameters = jax.jit(model.init)(jax.random.key(seed))
     dtype = jnp.result_type(*jax.tree.leaves(parameters))
-    fitted, held_out = (
-        phase_samples(part, dtype, np.random.default_rng(seed).permutation(len(part.t))[:most_samples])
-        for part in (train, validation)
-    )
+
+    def drawn(part: Trajectories) -> tuple[Array, ...]:
+        rows = np.random.default_rng(seed).permutation(len(part.t))[:most_samples]
+        return arrays_of(select_samples(part, rows), PHASE, dtype)
+
+    fitted, held_out = map(drawn, (train, validation))
     return selected_by(held_out, functools.partial(rate_residual, model), parameters, fitted, seed)
 
 
 def match_linear(
     model: Model, data: Trajectories, *, validation: Trajectories | None = None
-) -> tuple[Training, Float[np.ndarray, " N"]]:
+) -> tuple[Training, SampleVector]:
     """Fits a field that is linear in its parameters by least squares, in float64, and returns the validation errors.
 
     The errors are the squared errors of the validation samples, or of the fitted ones without a validation.
@@ -79,26 +82,19 @@ def match_linear(
     """
     began = time.perf_counter()
     with jax.enable_x64(True):
-        zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), jax.eval_shape(model.init, jax.random.key(0)))
+        zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes_of(model))
         columns = jax.jit(jax.jacrev(lambda c, *sample: rate_residual(model, c, *sample)))
-        arrays = phase_samples(data)
+        arrays = arrays_of(data, PHASE)
         design = np.asarray(jax.jit(jax.vmap(columns, in_axes=(None, 0, 0, 0, 0)))(zero, *arrays))
         target = -np.asarray(jax.jit(jax.vmap(functools.partial(rate_residual, model, zero)))(*arrays))
         solution = least_squares.solve(design.reshape(-1, design.shape[-1]), target.ravel())
         seconds = time.perf_counter() - began
-        judged = arrays if validation is None else phase_samples(validation)
+        judged = arrays if validation is None else arrays_of(validation, PHASE)
         errors = jax.vmap(functools.partial(rate_residual, model, jnp.asarray(solution.x)))(*judged)
         squares = np.sum(np.asarray(errors) ** 2, axis=1)
     fitted = solution.residual**2 / len(arrays[0])
     at = Progress(1, fitted, float(squares.mean()), float("nan"), seconds)
     return Training(jnp.asarray(solution.x), [at], Stop("finished", 1), 1, 0.0), squares
-
-
-def phase_samples(data: Trajectories, dtype: Any = jnp.float64, chosen: Any = slice(None)) -> tuple[Array, ...]:
-    """q, p, qd, pd of all samples, or of those chosen, on the device; `InputError` without p or pd, or on overflow."""
-    p, pd = momenta(data)
-    named = {"q": data.q, "p": p, "qd": data.qd, "pd": pd}
-    return tuple(on_device(name, array[chosen], dtype) for name, array in named.items())
 
 
 def accelerations_problem(

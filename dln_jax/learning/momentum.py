@@ -16,7 +16,7 @@ the residuals of any other model, and `acceleration_misfit` compares models of o
 """
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -28,15 +28,16 @@ from jaxtyping import Float, Int
 from dln_jax.data.encoders.sampling import EVEN
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import segments
-from dln_jax.learning.linear import unravelled
+from dln_jax.learning.linear import parameters_of, shapes_of, unravelled
 from dln_jax.learning.objectives import torque_scale
+from dln_jax.learning.posterior import Rows
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model
-from dln_jax.precision import quick_compilation
+from dln_jax.precision import compiled
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
-from dln_jax.types import InputError, Vector, require_positive
+from dln_jax.types import InputError, JointVector, Vector, require_positive
 
 WINDOW = 0.16
 """Length of a window in s: about two periods of the highest frequency that a low-pass at 12 Hz passes."""
@@ -57,7 +58,6 @@ class WeakFit(NamedTuple):
 
     parameters: Any
     """Parameters of the model, in its dtype."""
-    parameter_count: int
     rank: int
     condition: float
     errors: Float[np.ndarray, "W d"]
@@ -80,7 +80,7 @@ def fit_momentum(
     data: Trajectories,
     *,
     window: float = WINDOW,
-    noise: Float[np.ndarray, " d"] | None = None,
+    noise: JointVector | None = None,
     reweighted: bool = False,
     **tolerances: Any,
 ) -> WeakFit:
@@ -101,9 +101,9 @@ def fit_momentum(
         InputError: unequal steps, no segment as long as a window, torques that do not vary, or settings out of range.
     """
     require_positive(window=window)
-    d, like = data.degrees_of_freedom, jax.eval_shape(model.init, jax.random.key(0))
+    d, like = data.degrees_of_freedom, shapes_of(model)
     with jax.enable_x64(True):
-        scale = np.asarray(torque_scale(data)) if noise is None else np.asarray(noise, float)
+        scale = torque_scale(data) if noise is None else np.asarray(noise, float)
         if scale.shape != (d,) or not (scale > 0).all():
             raise InputError(f"noise is {scale}; expected a positive number for each of {d} joints")
         equations = list(_equations(functools.partial(_columns(model), np.zeros(count(like))), data, window))
@@ -129,10 +129,7 @@ def fit_momentum(
         except np.linalg.LinAlgError:
             break  # exact data leave no errors
         solution, errors = solve(factor)
-    parameters = jax.tree.map(
-        lambda leaf, as_built: jnp.asarray(leaf, as_built.dtype), unravelled(solution.x, like), like
-    )
-    return WeakFit(parameters, solution.x.size, solution.rank, solution.condition, errors)
+    return WeakFit(parameters_of(solution.x, like), solution.rank, solution.condition, errors)
 
 
 def momentum_and_rest(plant: Dynamics, q: Vector, qd: Vector) -> tuple[Vector, Vector]:
@@ -151,12 +148,12 @@ def window_weights(steps: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
 @functools.lru_cache(maxsize=4)
 def _columns(model: Model) -> Callable[..., Array]:
     """(theta [P], q, qd as [N, d]) -> derivatives [N, 2 d, P] of momentum and rest by theta, compiled."""
-    like = jax.eval_shape(model.init, jax.random.key(0))
+    like = shapes_of(model)
 
     def both(theta: Array, q: Vector, qd: Vector) -> Array:
         return jnp.concatenate(momentum_and_rest(dynamics(model.energies(unravelled(theta, like))), q, qd))
 
-    return jax.jit(jax.vmap(jax.jacrev(both), in_axes=(None, 0, 0)), compiler_options=quick_compilation())
+    return compiled(jax.vmap(jax.jacrev(both), in_axes=(None, 0, 0)))
 
 
 def _cut(data: Trajectories, window: float) -> tuple[list[Int[np.ndarray, "W S+1"]], float]:
@@ -178,9 +175,7 @@ def _cut(data: Trajectories, window: float) -> tuple[list[Int[np.ndarray, "W S+1
     return [own[:: max(1, steps // OVERLAP)] for own in windows], dt
 
 
-def _equations(
-    program: Callable[..., Array], data: Trajectories, window: float
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _equations(program: Callable[..., Array], data: Trajectories, window: float) -> Rows:
     """Columns [W, d, P] and right-hand sides [W, d] of windows, one chunk after the other."""
     pieces, dt = _cut(data, window)
     steps, d = pieces[0].shape[1] - 1, data.degrees_of_freedom

@@ -1,7 +1,7 @@
 """Objectives of training: the arrays that they read, the scales of their residuals, and the residuals of a sample."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.learning.engine.problem import arrays_of
 from dln_jax.mechanics.equations import Energies, System, driving_force, dynamics, hamiltonian_of
 from dln_jax.models.model import Model, Parameters
-from dln_jax.types import InputError, Vector
+from dln_jax.types import InputError, JointSamples, JointVector, Vector
 from dln_jax.zoo.catalogue import CATALOGUE
 
 
@@ -23,7 +23,7 @@ class Objective(NamedTuple):
 
     keys: tuple[str, ...]
     """Arrays [N, d] of `Trajectories` that the residual reads."""
-    scale: Callable[[Trajectories], Float[Array, " r"]]
+    scale: Callable[[Trajectories], np.ndarray]
     """Training data -> the scales of the residuals. Raises InputError if the data cannot determine the model."""
     residual: Callable[..., Float[Array, " r"]]
     """(system, *sample) -> residuals of one sample, in SI units."""
@@ -37,7 +37,7 @@ class Objective(NamedTuple):
         return self.residual is TORQUE.residual
 
 
-def torque_scale(data: Trajectories) -> Float[Array, " d"]:
+def torque_scale(data: Trajectories) -> JointVector:
     """Standard deviations of the torques [d], in N m or N: the scales of the residuals.
 
     A channel that does not vary (a joint without a motor) is scaled by the root mean square of those that do.
@@ -64,10 +64,10 @@ SCALED_TORQUE = TORQUE._replace(selects_by="scaled")
 """The same residual; validation errors are in units of the joints' `torque_scale`."""
 
 
-def _canonical_scale(data: Trajectories) -> Float[Array, " two_d"]:
+def _canonical_scale(data: Trajectories) -> np.ndarray:
     torque_scale(data)
     still = "is constant in every training sample: nothing moves, and no Hamiltonian can be told from another"
-    return jnp.concatenate([_scale(key, getattr(data, key), f"{key} {still}") for key in ("qd", "qdd")])
+    return np.concatenate([_scale(key, getattr(data, key), f"{key} {still}") for key in ("qd", "qdd")])
 
 
 def _canonical_residual(system: Energies, q: Vector, qd: Vector, qdd: Vector, p: Vector, tau: Vector) -> Array:
@@ -86,9 +86,9 @@ The published loss uses dp/dt of the data instead of qdd. In the published arm d
 with a mean square error of 8e-6 (N m)², while q, qd, qdd and tau are consistent to rounding."""
 
 
-def _both_scales(data: Trajectories) -> Float[Array, " two_d"]:
+def _both_scales(data: Trajectories) -> np.ndarray:
     still = "qdd is constant in every training sample; add trajectories that accelerate"
-    return jnp.concatenate([torque_scale(data), _scale("qdd", data.qdd, still)])
+    return np.concatenate([torque_scale(data), _scale("qdd", data.qdd, still)])
 
 
 FORWARD = SCALED_TORQUE._replace(
@@ -127,30 +127,20 @@ def objective_of(name: str, data: Trajectories, stated: str | None = None, *, to
     return torque if objective is TORQUE else objective
 
 
-def arrays(objective: Objective, data: Trajectories, dtype: Any) -> tuple[Array, ...]:
-    """Returns the arrays that an objective reads, on the device; `InputError` if one is missing or squares overflow."""
-    missing = [key for key in objective.keys if getattr(data, key) is None]
-    if missing:
-        raise InputError(f"the data have no {', '.join(missing)}, which this model is fitted to; add it to the file")
-    return arrays_of(data, objective.keys, dtype)
-
-
 def residuals(objective: Objective, system: System, batch: tuple[Array, ...]) -> Float[Array, "N r"]:
     """Residuals of a batch, in SI units."""
     return vmap(lambda *sample: objective.residual(system, *sample))(*batch)
 
 
-def squared_torque_errors(
-    model: Model, parameters: Parameters, data: Trajectories, scale: Float[np.ndarray, " d"]
-) -> Float[np.ndarray, "N d"]:
+def squared_torque_errors(model: Model, parameters: Parameters, data: Trajectories, scale: JointVector) -> JointSamples:
     """Squared torque error of every sample and joint, computed in float64, in units of the squared scale."""
     with jax.enable_x64(True):
         judge = jax.jit(lambda theta, batch: residuals(TORQUE, model.energies(theta), batch))
-        errors = np.asarray(judge(parameters, arrays(TORQUE, data, jnp.float64)))
+        errors = np.asarray(judge(parameters, arrays_of(data, TORQUE.keys)))
     return (errors / scale) ** 2
 
 
-def _scale(name: str, array: np.ndarray, message: str) -> Float[Array, " d"]:
+def _scale(name: str, array: np.ndarray, message: str) -> JointVector:
     """Standard deviations of the columns; a column that does not vary gets the root mean square of the others."""
     deviation = spread(name, array)
     # Rounding leaves a constant channel with a deviation of about 1e-17 of the numbers that it was computed from.
@@ -158,4 +148,4 @@ def _scale(name: str, array: np.ndarray, message: str) -> Float[Array, " d"]:
     if not varies.any():
         raise InputError(message)
     typical = (deviation[varies] ** 2).mean() ** 0.5
-    return jnp.asarray([size if moves else typical for size, moves in zip(deviation, varies, strict=True)])
+    return np.where(varies, deviation, typical)

@@ -25,7 +25,7 @@ from dln_jax.learning.engine.problem import better_of, mean_square, no_best
 from dln_jax.learning.linear import design, unravelled
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
-from dln_jax.precision import quick_compilation
+from dln_jax.precision import compiled
 from dln_jax.solvers import least_squares, levenberg_marquardt
 from dln_jax.types import InputError, require_positive
 
@@ -107,7 +107,7 @@ def make_refit(model: Model, *, rounds: int = 6, iterations: int = 5) -> Refit:
     def residual(parameters: Parameters, q: Array, qd: Array, qdd: Array, tau: Array, factor: Array) -> Array:
         return (dynamics(model.energies(parameters)).inverse_dynamics(q, qd, qdd) - tau) * factor
 
-    @partial(jax.jit, compiler_options=quick_compilation())
+    @compiled
     def refit(parameters: Parameters, replay: Replay) -> Parameters:
         unit = _scale(replay)
         fitted, held_out = (jnp.sqrt(weight)[:, None] / unit for weight in (replay.fitted, replay.held_out))

@@ -18,6 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from dln_jax.types import JointVector
+
 Rows = Iterator[tuple[np.ndarray, np.ndarray]]
 """Phi [n, d, P] and tau_hat - tau [n, d] in the joints' units, some samples at a time."""
 ALONE = 1e-6
@@ -36,7 +38,7 @@ class Spectrum(NamedTuple):
     """V, in columns."""
     triangles: Float[np.ndarray, "d r P"]
     """J_i D⁻¹ V of every joint, up to a rotation of its rows."""
-    squares: Float[np.ndarray, " d"]
+    squares: JointVector
     """Sums of squared residuals of the joints, in their units."""
     samples: int
 
@@ -46,9 +48,9 @@ class Posterior(NamedTuple):
 
     along: Float[np.ndarray, "K r"]
     """Factor of the covariance of D theta along the directions of the spectrum."""
-    noise: Float[np.ndarray, " d"]
+    noise: JointVector
     """Standard deviations, in the joints' units."""
-    degrees_of_freedom: Float[np.ndarray, " d"]
+    degrees_of_freedom: JointVector
 
 
 def spectrum(rows: Rows, *, negligible: float = 0.0) -> Spectrum:
@@ -79,7 +81,7 @@ def spectrum(rows: Rows, *, negligible: float = 0.0) -> Spectrum:
 
 def leave_out(
     spectrum: Spectrum,
-    noise: Float[np.ndarray, " d"],
+    noise: JointVector,
     columns: Float[np.ndarray, "n d P"],
     residual: Float[np.ndarray, "n d"],
 ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
@@ -103,7 +105,7 @@ def leave_out(
     return residual + predicted.T, np.maximum(np.sum((U @ covariance) * U, axis=2), 0.0).T
 
 
-def gram(rows: Float[np.ndarray, "d n P"], noise: Float[np.ndarray, " d"]) -> Float[np.ndarray, "P P"]:
+def gram(rows: Float[np.ndarray, "d n P"], noise: JointVector) -> Float[np.ndarray, "P P"]:
     """Returns the sum over joints of noise² rowsᵀ rows."""
     weighted = (rows * noise[:, None, None]).reshape(-1, rows.shape[2])
     return weighted.T @ weighted

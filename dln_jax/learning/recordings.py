@@ -120,7 +120,7 @@ def delay_of_torques(model: Model, recording: Trajectories) -> float:
         InputError: as for `smooth` and `fit_momentum`.
     """
     smoothed = smooth(recording)
-    unit = np.asarray(torque_scale(smoothed.data))
+    unit = torque_scale(smoothed.data)
 
     def errors(delay: int) -> np.ndarray:
         late = smooth(driven_torques(recording, delay=delay), smoothed.cutoff).data

@@ -14,14 +14,14 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.files import write_json
 from dln_jax.learning.engine.checkpoint import Context
-from dln_jax.types import InputError
+from dln_jax.types import InputError, SampleIndex, SampleVector
 
 SEGMENT = 0.5
 """Length in s of a segment whose mean error counts as one measurement: neighbouring samples are not independent."""
@@ -43,9 +43,11 @@ class Trial(NamedTuple):
         return mean if np.isfinite(mean) else math.inf
 
 
-def significantly_better(
-    errors: Float[np.ndarray, " N"], others: Float[np.ndarray, " N"], *, margin: float = 1.0
-) -> bool:
+Selection = tuple[Trial, list[Trial]]
+"""The chosen trial, and all trials."""
+
+
+def significantly_better(errors: SampleVector, others: SampleVector, *, margin: float = 1.0) -> bool:
     """Whether `errors` are lower than `others` on average, by more than `margin` standard errors of the difference."""
     gain = others - errors
     if not np.isfinite(gain.mean()):
@@ -67,13 +69,13 @@ def simplest(trials: Sequence[Trial]) -> Trial:
 
 def select(
     candidates: Iterable[Any],
-    fit: Callable[[Any], tuple[Any, Float[np.ndarray, " N"] | None]],
+    fit: Callable[[Any], tuple[Any, SampleVector | None]],
     *,
     rule: Callable[[Sequence[Trial]], Trial] = simplest,
     patience: int | float = math.inf,
     until: float = math.inf,
     stop: Callable[[Trial], bool] = lambda trial: False,
-) -> tuple[Trial, list[Trial]]:
+) -> Selection:
     """Fits candidates in order; returns the chosen trial and all trials.
 
     Args:
@@ -107,7 +109,7 @@ def select(
     return rule(fitted), trials
 
 
-def segments(data: Trajectories, seconds: float = SEGMENT) -> Int[np.ndarray, " N"]:
+def segments(data: Trajectories, seconds: float = SEGMENT) -> SampleIndex:
     """Returns the index of every sample's time segment; segments end at the ends of trajectories."""
     within = np.floor(data.t / seconds).astype(int)
     within -= within.min()

@@ -89,12 +89,16 @@ def cut_measured_windows(data: Trajectories, length: int) -> MeasuredWindows:
     return MeasuredWindows(t - t[:, :1], data.q[rows], data.qd[rows], data.tau[rows], weight, p, pd)
 
 
+Deviations = tuple[float, ...] | float
+"""Standard deviations of quantities, or one of all of them."""
+
+
 class Weights(NamedTuple):
     """Standard deviations that divide the residuals; a larger one gives less weight."""
 
-    state: tuple[float, ...] | float
+    state: Deviations
     """Standard deviations of q and p, one number or 2 d; infinite for quantities that were not measured."""
-    rate: tuple[float, ...] | float | None = None
+    rate: Deviations | None = None
     """Standard deviations of qd and pd, one number or 2 d; `None` leaves measured rates out."""
 
 
@@ -138,10 +142,6 @@ def phase_problem(
     """
     require_positive(substeps=substeps)
     require_windows(windows, validation, state_weight=weights.state, rate_weight=weights.rate)
-    if windows.p is None or validation.p is None:
-        raise InputError("the data have no p; add momenta, or rates in their place (per unit of mass)")
-    if weights.rate is not None and (windows.pd is None or validation.pd is None):
-        raise InputError("the weights count rates, which the windows lack; leave their weight out")
     keys = "t", "weight", "q", "p", *(("qd", "pd") if weights.rate is not None else ())
     fitted, held_out = (arrays_of(part, keys, jnp.result_type(float)) for part in (windows, validation))
 
@@ -169,9 +169,7 @@ def phase_problem(
     return selected_by(held_out, residual, unknowns, (jnp.arange(len(windows.t)), *fitted), seed, error=closest)
 
 
-def require_windows(
-    windows: MeasuredWindows, validation: MeasuredWindows, **deviations: tuple[float, ...] | float | None
-) -> None:
+def require_windows(windows: MeasuredWindows, validation: MeasuredWindows, **deviations: Deviations | None) -> None:
     """Raises `InputError` for a set without windows, or a standard deviation that is not positive."""
     for name, values in deviations.items():
         for deviation in np.ravel(values) if values is not None else ():
@@ -214,10 +212,10 @@ def _descend(residual: Callable[[Array], Array], start: Array, steps: int) -> tu
 class Noise(NamedTuple):
     """Standard deviations of the measurements, one per coordinate or one for all."""
 
-    q: tuple[float, ...] | float
-    qd: tuple[float, ...] | float | None = None
+    q: Deviations
+    qd: Deviations | None = None
     """`None` if velocities were not measured."""
-    tau: tuple[float, ...] | float | None = None
+    tau: Deviations | None = None
     """Standard deviation of the mean torque over a window; `None` if torques are exact. The torque error is then
     an unknown of every window, like its start."""
 

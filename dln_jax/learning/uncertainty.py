@@ -29,7 +29,6 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select, select_samples
@@ -39,7 +38,7 @@ from dln_jax.learning.posterior import TINY, Posterior, Rows, leading_directions
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.uncertainty import Domain, Uncertainty
 from dln_jax.solvers.normal_equations import count
-from dln_jax.types import InputError, require_positive
+from dln_jax.types import InputError, JointVector, SampleVector, require_positive
 
 RIDGES = (1e-18, 1e-16, 1e-14, 1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2)
 RATIOS = (0.0, *map(math.pow, [10.0] * 33, np.arange(-8, 25) / 4))
@@ -64,9 +63,9 @@ class Estimate(NamedTuple):
 
     uncertainty: Uncertainty
     ridge: float
-    degrees_of_freedom: Float[np.ndarray, " d"]
+    degrees_of_freedom: JointVector
     """Number of parameters that the joints' data determine."""
-    training_noise: Float[np.ndarray, " d"]
+    training_noise: JointVector
     """Standard deviation of the training residuals, N m or N, before calibration."""
 
 
@@ -77,7 +76,7 @@ def estimate(
     validation: Trajectories,
     *,
     ridge: float | None = None,
-    unit: Float[np.ndarray, " d"] | None = None,
+    unit: JointVector | None = None,
     negligible: float = 0.0,
     quantile: float = 0.999,
     margin: float = 1.25,
@@ -103,7 +102,7 @@ def estimate(
     if ridge is not None and not 0 <= ridge < np.inf:
         raise InputError(f"ridge is {ridge}; expected a number >= 0, or None to choose it by validation")
     with jax.enable_x64(True):
-        spread = np.asarray(torque_scale(train), np.float64)
+        spread = torque_scale(train)
         unit = spread if unit is None else np.asarray(unit, np.float64)
         parameters = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), parameters)
         if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(parameters)):
@@ -159,7 +158,7 @@ def estimate(
 
 
 def calibration(
-    residual: Float[np.ndarray, " N"], noise: float, variance: Float[np.ndarray, " N"], samples: float
+    residual: SampleVector, noise: float, variance: SampleVector, samples: float
 ) -> tuple[float, float, float]:
     """Returns (a, b) of a noise² + b variance for the residuals of one joint, and their mean negative log-likelihood.
 
@@ -185,7 +184,7 @@ def calibration(
     return float(a), float(b), float(unlikeliness)
 
 
-def scatter(relative: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
+def scatter(relative: SampleVector, trajectory: np.ndarray) -> float:
     """Returns the factor, at least 1, that raises a variance that is right on average, for a new motion.
 
     With s_m the mean square of the relative residuals of motion m, of M, and n_m their effective samples,
@@ -217,7 +216,7 @@ def scatter(relative: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
     return float((1 + np.sqrt((1 + 1 / M) * beyond)) * (stdtrit(M - 1, UPPER) / ndtri(UPPER)) ** 2)
 
 
-def effective_samples(residual: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
+def effective_samples(residual: SampleVector, trajectory: np.ndarray) -> float:
     """Effective number of independent samples for the variance: N / (1 + 2 sum of squared autocorrelations).
 
     The sum ends at the first lag whose autocorrelation is below 0.05 (Bayley and Hammersley 1946, for the squares).

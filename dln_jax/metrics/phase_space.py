@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.data.schema import momenta
+from dln_jax.data.schema import column
 from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.integrators import adaptive_rollout
 from dln_jax.models.model import Model, Parameters
@@ -49,13 +49,15 @@ def field_rates(
 def field_errors(model: Model, parameters: Parameters, part: PhaseSamples) -> dict[str, float]:
     """Returns `loss` against measured rates, and `clean_field_mse` against the exact field at the measured states."""
     data = part.data
-    p, measured = momenta(data)
-    qd, pd = field_rates(model, parameters, data.q, p)
+    qd, pd = field_rates(model, parameters, data.q, column(data, "p"))
 
     def mean_square(velocity: np.ndarray, force: np.ndarray) -> float:
         return float(np.mean(np.concatenate([qd - velocity, pd - force]) ** 2))
 
-    return {"loss": mean_square(data.qd, measured), "clean_field_mse": mean_square(part.field.qd, part.field.pd)}
+    return {
+        "loss": mean_square(data.qd, column(data, "pd")),
+        "clean_field_mse": mean_square(part.field.qd, part.field.pd),
+    }
 
 
 def predict(

@@ -255,7 +255,7 @@ def choices_of(fit: Fit, parts: Parts, log: Log) -> dict[str, Any]:
     if log.smoothed is not None:
         chosen["cutoff_hz"] = log.smoothed.cutoff
     if fit.objective is SCALED_TORQUE:
-        chosen["validation_units"] = np.asarray(torque_scale(parts.sets.train)).tolist()
+        chosen["validation_units"] = torque_scale(parts.sets.train).tolist()
     return chosen | {"seeds": fit.seeds}
 
 

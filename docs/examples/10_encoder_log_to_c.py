@@ -20,9 +20,10 @@ from dln_jax.data.encoders.smoothing import smooth
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import select
 from dln_jax.figures import style
-from dln_jax.identification.identify import identify, parameters_of
+from dln_jax.identification.identify import identify
 from dln_jax.learning import uncertainty
 from dln_jax.learning.friction import fit_friction
+from dln_jax.learning.linear import parameters_of
 from dln_jax.mechanics.trees.description import dh_frames, serial
 from dln_jax.mechanics.trees.frames import world_frames
 from dln_jax.mechanics.trees.inertia import inertial_parameters

@@ -10,8 +10,8 @@ from dln_jax import dynamics, joint_dissipation, read_robot, tree_system
 from dln_jax.commands import identify
 from dln_jax.data.schema import from_arrays
 from dln_jax.identification.equations import columns_of, flat
-from dln_jax.identification.identify import parameters_of
 from dln_jax.identification.motions import cut_motions, fit_motions, linearise
+from dln_jax.learning.linear import parameters_of
 from dln_jax.learning.shooting import motion
 from dln_jax.models.trees import make_rigid_tree
 

@@ -66,7 +66,6 @@ def test_finished_candidates_are_stored_and_not_fitted_again(workplace, tmp_path
     monkeypatch.setattr(automatic, "identify_robot", interrupted)
     for name in names:
         monkeypatch.setattr(automatic, name, lambda **_: SimpleNamespace(fit=lambda *_: "not in this test"))
-    monkeypatch.setattr(automatic, "with_network", lambda *_: "not in this test")
     fit = chosen(tmp_path, resume=True)
     assert fit.description == kept.description
     jax.tree.map(np.testing.assert_array_equal, fit.parameters, kept.parameters)

@@ -26,14 +26,13 @@ from dln_jax.identification.identify import (
     identify,
     lost,
     parameter_rows,
-    parameters_of,
     random_states,
     summary,
     text,
 )
-from dln_jax.identification.residual import Candidate, fit_residual
+from dln_jax.identification.residual import fit_residual
 from dln_jax.identification.weighted import fit_weighted
-from dln_jax.learning.linear import fit_linear
+from dln_jax.learning.linear import fit_linear, parameters_of
 from dln_jax.learning.select import segments
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees.description import serial
@@ -216,7 +215,7 @@ def sprung(stiffness):
 def test_a_network_is_added_only_where_it_helps(stiffness):
     train, validation, test = (select(sprung(stiffness), which) for which in ([0, 1, 2], [3, 4], [5]))
     identified = fit_linear(MODEL, train, negligible=1e-12).parameters
-    candidates = (Candidate(), Candidate(("potential",), 6))
+    candidates = ((("potential",), 6),)
     result = fit_residual(MODEL, identified, ARM.needs, train, validation, candidates=candidates, iterations=30)
 
     def error(model, parameters):
@@ -226,7 +225,7 @@ def test_a_network_is_added_only_where_it_helps(stiffness):
     if stiffness:
         assert error(result.model, result.parameters) < 0.2 * error(MODEL, identified)
     else:
-        assert result.model is MODEL and not result.chosen.terms
+        assert result.model is MODEL and not result.settings
 
 
 def test_segments_stay_within_trajectories():
@@ -246,10 +245,6 @@ def test_mistakes_are_named(noisy):
         (lambda: nearest_body(np.zeros(10)), "no mass"),
         (lambda: make_residual(ARM.needs, terms=()), "terms are"),
         (lambda: make_residual(ARM.needs, torque_scale=0.0), "torque_scale"),
-        (
-            lambda: fit_residual(MODEL, None, ARM.needs, data, data, candidates=[Candidate(("potential",), 6)]),
-            "candidates start with a network",
-        ),
     ):
         with one_line(words):
             call()

@@ -33,7 +33,7 @@ def candidate(*shares):
 
 def compared(validation=VALIDATION, **more):
     """The kept candidate, what is told of each, and why the comparison ended."""
-    usual = {"noise": np.nan, "until": np.inf, "definite": lambda model: True, "beside": lambda model: None}
+    usual = {"noise": np.nan, "until": np.inf, "definite": lambda model: True}
     candidates, more = more.pop("candidates"), {**usual, "say": lambda line: None, **more}
     kept, rows, ended = compare(candidates, TRAIN, validation, **more)
     return kept.candidate, rows, ended
@@ -67,17 +67,6 @@ def test_out_of_time_the_first_that_can_be_fitted_is_kept():
     candidates = {"refused": lambda: "too large", "first": candidate(1, 1), "second": candidate(1, 1)}
     kept, rows, ended = compared(candidates=candidates, until=0.0)
     assert kept == "first" and ended == "time is out; not tried: second" and len(rows) == 2
-
-
-def test_one_more_candidate_is_made_of_the_best():
-    names = []
-
-    def beside(best):
-        names.append(float(best.parameters[0]))
-        return "better", candidate(1, 1)
-
-    assert compared(candidates={"rough": candidate(1.5, 1.5)}, beside=beside)[0] == "better" and names == [1.5]
-    assert compared(candidates={"rough": candidate(1.5, 1.5)}, beside=lambda best: None)[0] == "rough"
 
 
 def test_what_cannot_be_fitted_is_refused():

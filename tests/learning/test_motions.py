@@ -75,7 +75,7 @@ def test_mistakes_are_named():
         (lambda: pose(windows._replace(t=windows.t[:0]), weights=Weights(0.1)), "0 to validate"),
         (lambda: pose(windows, substeps=0, weights=Weights(0.1)), "substeps is 0"),
         (lambda: pose(windows, weights=Weights(0.0)), "state_weight is 0"),
-        (lambda: pose(windows, weights=Weights(1.0, 1.0)), "which the windows lack"),
+        (lambda: pose(windows, weights=Weights(1.0, 1.0)), "the data have no pd"),
     ]:
         with one_line(message):
             call()

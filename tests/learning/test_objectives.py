@@ -9,8 +9,8 @@ from calls import one_line
 
 from dln_jax.data.splits import split
 from dln_jax.learning.dynamics import problem
-from dln_jax.learning.engine.problem import loss_of
-from dln_jax.learning.objectives import BOTH_WAYS, STATED, arrays, objective_of, residuals
+from dln_jax.learning.engine.problem import arrays_of, loss_of
+from dln_jax.learning.objectives import BOTH_WAYS, STATED, objective_of, residuals
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.pendulums import cart_pole
@@ -34,7 +34,7 @@ def model_of(name, data):
 
 @pytest.mark.parametrize("objective", STATED)
 def test_residuals_vanish_for_the_true_plant(data, objective):
-    found = residuals(STATED[objective], cart_pole(friction=0.3).energies, arrays(STATED[objective], data, jnp.float64))
+    found = residuals(STATED[objective], cart_pole(friction=0.3).energies, arrays_of(data, STATED[objective].keys))
     assert found.shape == (60, 4 if objective == "both" else 2)
     assert float(jnp.abs(found).max()) < 1e-10
 

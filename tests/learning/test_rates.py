@@ -85,7 +85,10 @@ def test_mistakes_are_named(swing):
     for call, message in [
         (lambda: rates_problem(model, data, data, most_samples=0), "most_samples is 0"),
         (lambda: rates_problem(model, data, data, seed=-1), "seed is -1"),
-        (lambda: rates_problem(model, data._replace(p=None), data), "p and pd, which the data do not have"),
+        (
+            lambda: rates_problem(model, data._replace(p=None), data),
+            "the data have no p, which this model",
+        ),
         (lambda: hold_out(data, 1.5, 0), "validation_share is 1.5"),
         (lambda: hold_out(data._replace(trajectory=0 * data.trajectory), 0.1, 0), "there are 1 trajectories"),
         (lambda: make_polynomial_hamiltonian(needs, degree=1), "degree is 1"),

@@ -17,8 +17,9 @@ from dln_jax.data.encoders.smoothing import Smoothed, smooth
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import in_blocks, select
 from dln_jax.identification import equations
-from dln_jax.identification.identify import Identification, identify, parameters_of
+from dln_jax.identification.identify import Identification, identify
 from dln_jax.identification.motions import REWEIGHTINGS, MotionFit, cut_motions, fit_motions
+from dln_jax.learning.linear import parameters_of
 from dln_jax.metrics.predictions import cut_segments, predict_measured, valid_times
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError

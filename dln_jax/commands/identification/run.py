@@ -25,11 +25,12 @@ from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.splits import Split, is_cut
 from dln_jax.figures.torques import friction_curves, torque_by_joint
 from dln_jax.files import write_bytes, write_json
-from dln_jax.identification.identify import base_rows, findings, identify, parameter_rows, parameters_of, summary, text
+from dln_jax.identification.identify import base_rows, findings, identify, parameter_rows, summary, text
 from dln_jax.identification.residual import inner_split
 from dln_jax.identification.rigid_tree import at_reference, build_rigid_tree, describe_rigid_tree
 from dln_jax.learning.fit import Fit, with_uncertainty
 from dln_jax.learning.friction import reference_temperature
+from dln_jax.learning.linear import parameters_of
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import require_laws, shape_of
 from dln_jax.mechanics.trees.motors import Pair, armature_matrix, require_motors

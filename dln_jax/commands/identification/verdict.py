@@ -11,8 +11,9 @@ from dln_jax.data.encoders.sampling import torque_noise
 from dln_jax.data.log import Log
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import every
-from dln_jax.identification.identify import Identification, parameters_of
+from dln_jax.identification.identify import Identification
 from dln_jax.identification.rigid_tree import MOST, shared_motor
+from dln_jax.learning.linear import parameters_of
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.metrics.verdict import WORSE, Verdict, held_out, judge, verdict_metrics, worst
 from dln_jax.models.model import Parameters

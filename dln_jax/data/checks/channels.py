@@ -3,12 +3,13 @@
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
 from dln_jax.data.encoders.sampling import step_of, timing
 from dln_jax.data.encoders.smoothing import PART, Smoothed
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import LEAST_TRAJECTORIES
+from dln_jax.types import JointSamples, JointVector, SampleIndex
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
@@ -214,9 +215,7 @@ def flat_share(channel: np.ndarray, trajectory: np.ndarray, step: float) -> floa
     return float(cut / len(channel))
 
 
-def _match(
-    measured: Float[np.ndarray, "N d"], derived: Float[np.ndarray, "N d"], part: Int[np.ndarray, " N"], farthest: int
-) -> tuple[Float[np.ndarray, " d"], ...]:
+def _match(measured: JointSamples, derived: JointSamples, part: SampleIndex, farthest: int) -> tuple[JointVector, ...]:
     """Least-squares match of two signals in every channel, measured(t) = factor * derived(t - delay).
 
     Returns the factors, the delays in samples, the correlations, and the squared error without delay divided by that
@@ -249,7 +248,7 @@ def vertex(values: np.ndarray, lowest: int | np.integer) -> float:
     return float(0.5 * (before - after) / curvature) if curvature > 0 else 0.0
 
 
-def away_from_ends(part: Int[np.ndarray, " N"], farthest: int) -> Int[np.ndarray, " n"]:
+def away_from_ends(part: SampleIndex, farthest: int) -> Int[np.ndarray, " n"]:
     """Indices of samples with `farthest` neighbours of the same part on either side."""
     places = np.arange(farthest, len(part) - farthest)
     return places[(part[places - farthest] == part[places]) & (part[places + farthest] == part[places])]

@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
+from dln_jax.types import JointVector
 
 ITERATIONS = 12
 """Iterations of the likelihood maximisation; one digit of the weights is enough."""
@@ -50,7 +51,7 @@ class Hypothesis(NamedTuple):
     data: Trajectories
     rows: np.ndarray
     """Indices of the samples used [n]."""
-    signs: Float[np.ndarray, " d"]
+    signs: JointVector
     """-1 for torques with the wrong sign."""
     order: tuple[int, ...]
     """Column of tau for every joint."""

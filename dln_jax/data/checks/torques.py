@@ -19,6 +19,7 @@ from jaxtyping import Float
 from dln_jax.data.checks.channels import TURNS, Finding, away_from_ends, findings_of, vertex
 from dln_jax.data.checks.priors import BLOCKS, SCALES, Build, Explanation, Hypothesis, any_energy, blocks_of, explain
 from dln_jax.data.schema import Trajectories
+from dln_jax.types import JointVector
 
 DECISIVE = 15.0
 """Log likelihood ratio over all blocks that is required to decide: odds of three million to one."""
@@ -64,19 +65,19 @@ class Torques(NamedTuple):
     """Log likelihood ratio of no delay against every delay tried."""
     likely_delay: float
     """Delay with the lowest loss, in samples."""
-    viscous: Float[np.ndarray, " d"]
+    viscous: JointVector
     """N m s or N s/m."""
-    coulomb: Float[np.ndarray, " d"]
+    coulomb: JointVector
     """N m or N."""
-    coulomb_error: Float[np.ndarray, " d"]
+    coulomb_error: JointVector
     """Standard deviation of `coulomb`."""
-    velocity_scale: Float[np.ndarray, " d"]
+    velocity_scale: JointVector
     """1/s or m/s: velocity scale of the smooth sign change of dry friction."""
     rest: Float[np.ndarray, "n d"]
     """Friction and noise: torques minus everything else that was explained."""
 
     @property
-    def explained(self) -> Float[np.ndarray, " d"]:
+    def explained(self) -> JointVector:
         """Fraction of each torque's variance that is predicted in left-out blocks after repair."""
         return 1 - self.repaired.unexplained.mean(axis=0)
 
@@ -225,7 +226,7 @@ def _impossible(now: Explanation) -> np.ndarray:
     return np.minimum(_inertias(now), _friction(now)[-1]) < NEGATIVE
 
 
-def _inertias(now: Explanation) -> Float[np.ndarray, " d"]:
+def _inertias(now: Explanation) -> JointVector:
     """Mean inertia of every joint divided by its standard deviation."""
     q, d = now.log.states()[0], len(now.log.order)
     q = np.repeat(q[np.linspace(0, len(q) - 1, INERTIAS).astype(int)], d, axis=0)

@@ -14,7 +14,7 @@ from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.recursions import regressor
-from dln_jax.precision import quick_compilation
+from dln_jax.precision import compiled
 from dln_jax.solvers import least_squares
 from dln_jax.types import JointKind
 
@@ -186,7 +186,7 @@ def _program(parents: tuple[int, ...], joints: tuple[JointKind, ...], axes: tupl
         return regressor(tree, q, qd, qdd)
 
     batch = jax.vmap(one, in_axes=(None, None, None, 0, 0, 0))
-    return jax.jit(batch, compiler_options=quick_compilation())
+    return compiled(batch)
 
 
 def near_tree(

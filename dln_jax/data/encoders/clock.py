@@ -13,9 +13,10 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from dln_jax.data.schema import Trajectories
+from dln_jax.types import SampleVector
 
 JITTER = 0.05
 """Smallest standard deviation of the stamps' steps that is repaired, in periods."""
@@ -41,7 +42,7 @@ Counts = tuple[np.ndarray, np.ndarray]
 class Clock(NamedTuple):
     """Times of N rows on their source's clock."""
 
-    t: Float[np.ndarray, " N"]
+    t: SampleVector
     period: float
     """s."""
     jitter: float

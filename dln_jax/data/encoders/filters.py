@@ -34,10 +34,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from dln_jax.data.encoders.sampling import NORMAL, by_trajectory, spline
-from dln_jax.types import InputError, require_positive
+from dln_jax.types import InputError, JointSamples, JointVector, SampleIndex, require_positive
 
 ORDER = 4
 """Order of the Butterworth filter, which is applied twice."""
@@ -89,7 +89,7 @@ class Choice(NamedTuple):
     """Hz."""
     spectrum: Float[np.ndarray, "F d"]
     """Spectrum of q, (rad or m)² / Hz."""
-    floor: Float[np.ndarray, " d"]
+    floor: JointVector
     """White part of N, in the same unit."""
 
 
@@ -154,9 +154,7 @@ def derivatives(
     return curve(t, nu=1), curve(t, nu=2)
 
 
-def choose_cutoff(
-    q: Float[np.ndarray, "N d"], trajectory: Int[np.ndarray, " N"], *, rate: float, noise: Float[np.ndarray, " d"]
-) -> Choice:
+def choose_cutoff(q: JointSamples, trajectory: SampleIndex, *, rate: float, noise: JointVector) -> Choice:
     """Finds the cut-off with the lowest expected error.
 
     Args:

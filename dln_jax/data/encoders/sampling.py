@@ -15,11 +15,11 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import GAP, segments, select_samples
-from dln_jax.types import InputError
+from dln_jax.types import InputError, JointSamples, JointVector, SampleIndex, SampleVector
 
 BRIDGED = 3.5
 """Gaps up to this multiple of the median step are interpolated; longer ones cut a trajectory."""
@@ -80,7 +80,7 @@ class Repeats(NamedTuple):
         return self.q & self.tau
 
 
-def timing(t: Float[np.ndarray, " N"], trajectory: Int[np.ndarray, " N"]) -> Timing:
+def timing(t: SampleVector, trajectory: SampleIndex) -> Timing:
     """Computes rate, jitter and gaps.
 
     Raises:
@@ -154,7 +154,7 @@ def held_at_equal_steps(data: Trajectories, rate: float | None = None) -> Trajec
     return data._replace(t=t, q=q, qd=absent, qdd=absent, tau=tau, trajectory=trajectory, **dropped)
 
 
-def noise_of(values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"]) -> Float[np.ndarray, " k"]:
+def noise_of(values: Float[np.ndarray, "N k"], trajectory: SampleIndex) -> Float[np.ndarray, " k"]:
     """Standard deviation of the white noise of every channel, in its unit, at least its quantisation noise, step / √12.
 
     Samples are at equal steps except for gaps, which are rare; trajectories of fewer than seven samples are ignored.
@@ -171,7 +171,7 @@ def noise_of(values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"]
     return np.maximum(np.min(spreads, axis=0), smallest)
 
 
-def torque_noise(data: Trajectories) -> Float[np.ndarray, " d"] | None:
+def torque_noise(data: Trajectories) -> JointVector | None:
     """Standard deviation of the white noise of every torque, N m or N; `None` if the sampling is too slow to tell.
 
     The noise of the positions, which are measured much better than torques, shows whether it is.
@@ -227,9 +227,7 @@ def delay_held(values: Float[np.ndarray, "N k"], samples: float) -> Float[np.nda
     return (1 - share) * held[1:] + share * held[:-1]
 
 
-def find_repeats(
-    q: Float[np.ndarray, "N d"], tau: Float[np.ndarray, "N d"], trajectory: Int[np.ndarray, " N"]
-) -> Repeats:
+def find_repeats(q: JointSamples, tau: JointSamples, trajectory: SampleIndex) -> Repeats:
     """Finds repeated samples of q and of tau; torques that never vary repeat with q."""
     of_q, after = _repeating(q, trajectory)
     of_tau, _ = _repeating(tau, trajectory)

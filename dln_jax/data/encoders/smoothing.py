@@ -35,7 +35,7 @@ from dln_jax.data.encoders.filters import Choice, choose_cutoff, derivatives, lo
 from dln_jax.data.encoders.sampling import Repeats, interpolate, noise_of, without_repeats
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import segments, select_samples
-from dln_jax.types import InputError, require_positive
+from dln_jax.types import InputError, JointVector, require_positive
 
 SHORT = 0.01
 """s: gaps up to this length are bridged, too, whatever the rate: a cubic spline through motions of 10 Hz is off by 4e-4
@@ -64,9 +64,9 @@ class Smoothed(NamedTuple):
     """Cut-off of the filter, Hz; infinite without a filter."""
     rate: float
     """Sampling rate before decimation, Hz."""
-    noise_q: Float[np.ndarray, " d"]
+    noise_q: JointVector
     """Standard deviation of every encoder's noise, rad or m."""
-    noise_tau: Float[np.ndarray, " d"]
+    noise_tau: JointVector
     """Standard deviation of the noise of every torque of `data`, N m or N; zero without torques."""
     choice: Choice | None
     """Data behind the choice of the cut-off; `None` if the cut-off was set."""
@@ -191,7 +191,7 @@ class LocalRates(NamedTuple):
     """Trajectories with q, qd and qdd from local polynomials; all else is unchanged."""
 
     data: Trajectories
-    noise: Float[np.ndarray, " d"]
+    noise: JointVector
     """Standard deviation of the noise of q, rad or m."""
     resolved: Bool[np.ndarray, " d"]
     """Whether more than the fewest neighbours were best; if not, the noise may be the curvature of a coarse motion."""

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.frames import world_frames
-from dln_jax.types import InputError
+from dln_jax.types import InputError, JointVector
 
 SECONDS_TO_SPEED = 0.2
 """s: assumed time to full velocity if no acceleration limit is stated."""
@@ -30,9 +30,9 @@ class MotionLimits(NamedTuple):
 
     position: Float[np.ndarray, "d 2"]
     """Lower and upper, rad or m; finite."""
-    velocity: Float[np.ndarray, " d"]
+    velocity: JointVector
     """1/s or m/s; finite."""
-    acceleration: Float[np.ndarray, " d"]
+    acceleration: JointVector
     """1/s² or m/s²; finite."""
     force: Float[np.ndarray, "d 2"]
     """Lower and upper, N m or N; both infinite for a joint without a limit."""

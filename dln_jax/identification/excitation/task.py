@@ -28,9 +28,9 @@ from dln_jax.identification.equations import NEGLIGIBLE
 from dln_jax.identification.excitation.limits import Clearance, Excess, MotionLimits, beyond, require_limits
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters, linearised
-from dln_jax.precision import quick_compilation, require_double_precision
+from dln_jax.precision import compiled, require_double_precision
 from dln_jax.solvers.least_squares import scaled_columns
-from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.types import InputError, JointVector, require_positive, require_seed
 
 MOST_HARMONICS = 50
 """Upper limit of harmonics for a design: more give no smooth motion and take hours."""
@@ -119,7 +119,7 @@ class Task(NamedTuple):
     """N, samples of one period on the design grid."""
     columns: Int[np.ndarray, " B"]
     """Indices of the base parameters among all parameters of the model."""
-    noise: Float[np.ndarray, " d"]
+    noise: JointVector
     limits: MotionLimits
     period: float
     """s."""
@@ -177,7 +177,7 @@ def make_task(
         )
         return Phi, tau, excess
 
-    samples = jax.jit(jax.vmap(observe), compiler_options=quick_compilation())
+    samples = compiled(jax.vmap(observe))
     random, steps, seen = np.random.default_rng(seed), SAMPLES * harmonics, []
     for _ in range(-(-STATES // steps)):
         q = random.uniform(limits.position[:, 0], limits.position[:, 1], (steps, d))

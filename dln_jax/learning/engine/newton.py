@@ -21,7 +21,7 @@ from dln_jax.learning.engine.problem import (
     by_devices,
     no_best,
 )
-from dln_jax.precision import quick_compilation
+from dln_jax.precision import compiled
 from dln_jax.scale import first, replicate, shard, spread
 from dln_jax.solvers import levenberg_marquardt
 from dln_jax.solvers.levenberg_marquardt import Arrays, LevenbergMarquardtState, Status
@@ -94,7 +94,7 @@ def _stage(
         chunks = jax.jit(lambda arrays: levenberg_marquardt.in_chunks(arrays, shared.samples))(arrays)
         chunks = replicate(chunks, shared.seeds) if shared.samples is None else shard(chunks, shared.samples)
         advance = spread(lambda whole, solver: iterate(solver, *whole, samples=len(arrays[0])), shared.seeds)
-        advance = jax.jit(advance, compiler_options=quick_compilation())
+        advance = compiled(advance)
         advance = advance.lower((chunks, np.asarray(0)), state.solver).compile()
 
         def score(parameters: Any) -> Array:

@@ -1,7 +1,7 @@
 """Inputs, stages and results of a training run, for any model and optimiser, and how devices share the work."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -84,9 +84,11 @@ def selected_by(
     return Problem(residual, parameters, arrays, score, seed)
 
 
-def arrays_of(record: Any, keys: Iterable[str] | None = None, dtype: Any = jnp.float64) -> tuple[Array, ...]:
-    """Returns fields of a record of NumPy arrays on the device (default: all); `InputError` if squares overflow."""
-    return tuple(on_device(key, getattr(record, key), dtype) for key in keys or record._fields)
+def arrays_of(record: Any, keys: Sequence[str], dtype: Any = jnp.float64) -> tuple[Array, ...]:
+    """Returns fields of a record of NumPy arrays on the device; `InputError` if one is missing or squares overflow."""
+    if missing := [key for key in keys if getattr(record, key) is None]:
+        raise InputError(f"the data have no {', '.join(missing)}, which this model is fitted to; add it to the file")
+    return tuple(on_device(key, getattr(record, key), dtype) for key in keys)
 
 
 def unmonitored(value: Scalar) -> tuple[Scalar, Scalar]:

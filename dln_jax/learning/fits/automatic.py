@@ -3,7 +3,7 @@
 Models are compared on the validation motions by squared torque errors in units of the joints' variances, so that a
 wrist counts as much as a shoulder. Models whose mass matrices are positive definite come before others, unless they
 explain much less: without such a matrix, accelerations are wrong. The selection ends early if the errors equal the
-noise of the torques, or rounding, and when time is up. A residual network is tried once, on the model that is kept.
+noise of the torques, or rounding, and when time is up.
 """
 
 import math
@@ -15,38 +15,29 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from dln_jax.data.arrays import spread
 from dln_jax.data.encoders.sampling import noise_of
 from dln_jax.data.joints import needs_from_json
 from dln_jax.data.log import Log, Parts
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import every
 from dln_jax.files import is_file, read_json, write_json
-from dln_jax.identification import residual
-from dln_jax.identification.identify import identify, parameters_of
+from dln_jax.identification.identify import identify
 from dln_jax.identification.rigid_tree import build_rigid_tree, describe_rigid_tree
 from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.learning.fit import Fit, direct_fit
-from dln_jax.learning.fits.direct import needs_of_tree, with_joint_laws
+from dln_jax.learning.fits.direct import with_joint_laws
 from dln_jax.learning.fits.settings import Automatic, Kernel, LearnedTree, Network, Trigonometric
-from dln_jax.learning.linear import MOST_PARAMETERS, parameters_of_degree
+from dln_jax.learning.linear import MOST_PARAMETERS, parameters_of, parameters_of_degree
 from dln_jax.learning.objectives import squared_torque_errors, torque_scale
 from dln_jax.learning.select import Trial, lowest, mean_of_segments, say_selection, select, simplest
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction import USUAL
-from dln_jax.mechanics.trees.description import tree_to_json
 from dln_jax.metrics.errors import definiteness
-from dln_jax.models.trees import RigidTreeParameters, tree_of
-from dln_jax.types import InputError, Needs
-from dln_jax.zoo.descriptions import describe
+from dln_jax.types import InputError, JointVector, Needs
 from dln_jax.zoo.run import load
 
 SELECTION_SECONDS, CANDIDATE_SECONDS = 300.0, 120.0
 """Default time limits, s: for the whole selection, and for one search or network in it."""
-MOST_SAMPLES = 4_000
-"""Largest number of samples for fitting residual networks and shapes of friction."""
 EXACT = 1e-12
 """No further candidate is tried once the normalised error of every joint is below this."""
 LEAST_NOISE, MOST_NOISE = 0.5, 1.2
@@ -55,7 +46,6 @@ error shows that the estimate of the noise is wrong."""
 USEFUL, PRICE = 0.25, 10.0
 """Largest mean normalised error of a model that a verdict does not refuse, as in `metrics.verdict`, and the largest
 factor on the least mean error that a positive definite mass matrix may cost."""
-NETWORK, BESIDE = "structured-delan", "-residual"
 
 
 def fit(settings: Automatic, log: Log, parts: Parts, context: Context) -> Fit:
@@ -74,13 +64,6 @@ def fit(settings: Automatic, log: Log, parts: Parts, context: Context) -> Fit:
     limited = math.isfinite(context.until)
     context = context.within(math.inf if limited else SELECTION_SECONDS)
     attempt = partial(fit_or_load, log, parts, context, math.inf if limited else CANDIDATE_SECONDS)
-
-    def beside(base: Fit) -> tuple[str, Callable[[], Fit | str]] | None:
-        if not (base.properties.linear or base.properties.searched):
-            return None
-        name = base.name + BESIDE
-        return name, partial(attempt, name, partial(with_network, base))
-
     chosen, rows, ended = compare(
         {name: partial(attempt, name, candidate) for name, candidate in candidates_of(settings, log)},
         train,
@@ -88,7 +71,6 @@ def fit(settings: Automatic, log: Log, parts: Parts, context: Context) -> Fit:
         noise=noise_of(train.tau, train.trajectory),
         until=context.until,
         definite=lambda result: is_definite(result, parts),
-        beside=beside,
         say=context.say,
     )
     say_selection(context, "candidates, by errors on validation motions", chosen.candidate, ended, rows)
@@ -100,10 +82,9 @@ def compare(
     train: Trajectories,
     validation: Trajectories,
     *,
-    noise: Float[np.ndarray, " d"] | float,
+    noise: JointVector | float,
     until: float,
     definite: Callable[[Any], bool],
-    beside: Callable[[Any], tuple[str, Callable[[], Any]] | None],
     say: Callable[[str], None],
 ) -> tuple[Trial, list[dict[str, Any]], str]:
     """Fits candidates in order; chooses the first that no other betters significantly, definite ones before others.
@@ -118,13 +99,12 @@ def compare(
         noise: standard deviation of the joints' torque noise, N m or N, or NaN; the comparison ends at such errors.
         until: reading of `time.perf_counter` after which no further candidate is tried, once one is fitted.
         definite: whether a model's mass matrix is positive definite; true for models without one.
-        beside: chosen model -> one more candidate made of it, tried unless the comparison has ended.
         say: takes a line on each candidate.
 
     Raises:
         InputError: torques that do not vary, or no candidate that could be fitted.
     """
-    scale, rows, ended = np.asarray(torque_scale(train)), {}, ""
+    scale, rows, ended = torque_scale(train), {}, ""
     share = (noise / scale) ** 2
 
     def attempt(name: str, candidate: Callable[[], Any]) -> tuple[Any, np.ndarray | None]:
@@ -173,9 +153,6 @@ def compare(
     left = list(candidates)[len(trials) :]
     if left and not ended:
         ended = f"time is out; not tried: {', '.join(left)}"
-    if not ended and (more := beside(chosen.outcome)) is not None:
-        trial = Trial(more[0], *attempt(*more))
-        chosen = rule([chosen, trial]) if trial.errors is not None else chosen
     return chosen, list(rows.values()), ended
 
 
@@ -196,7 +173,7 @@ def candidates_of(settings: Automatic, log: Log) -> list[tuple[str, Candidate]]:
     return [
         *[("rigid-tree", lambda log, parts, context: identify_robot(log, parts))] * (log.robot is not None),
         *([explicit, learned] if small else [learned, explicit, ("trigonometric-kernel", Kernel().fit)]),
-        (NETWORK, Network().fit),
+        ("structured-delan", Network().fit),
     ]
 
 
@@ -253,41 +230,3 @@ def identify_robot(log: Log, parts: Parts) -> Fit:
     solution = identify(model, known, train, joints=needs.joints)
     parameters = parameters_of(solution.theta, known)
     return direct_fit(description, needs, parts, parameters, seconds=time.perf_counter() - began)
-
-
-def with_network(base: Fit, log: Log, parts: Parts, context: Context) -> Fit | str:
-    """Adds a residual network to a model if held-out motions justify it.
-
-    Its size is chosen on a part of the training set: chosen on the motions that the candidates are compared by, it
-    would fit them.
-    """
-    began, train = time.perf_counter(), parts.sets.train
-    base = rigid_tree_of(base, log, parts) if base.properties.searched else base
-    fitted, chosen_by = residual.inner_split(train)
-    added = residual.fit_residual(
-        base.model,
-        base.parameters,
-        log.needs,
-        every(fitted, -(-len(fitted.t) // MOST_SAMPLES)),
-        chosen_by,
-        seconds=min(context.seconds, CANDIDATE_SECONDS),
-    )
-    if not added.settings:
-        return "a residual network does not lower the validation error"
-    keywords = {key: value for key, value in base.description.items() if key not in ("name", "precision")}
-    description = describe(f"{base.name}{BESIDE}", precision="f64", **keywords, **added.settings)
-    return direct_fit(description, base.needs, parts, added.parameters, seconds=time.perf_counter() - began)
-
-
-def rigid_tree_of(learned: Fit, log: Log, parts: Parts) -> Fit:
-    """A learned tree as a rigid tree with the same frames, bodies and friction."""
-    needs, stated, solution = needs_of_tree(log.needs), learned.description, learned.parameters
-    tree = tree_of(solution, needs, parents=stated["parents"], acceleration=stated["acceleration"])
-    of_rigid = needs._replace(friction=False, joint_friction=USUAL if needs.friction else ())
-    description = describe(
-        "rigid-tree", precision="f64", needs=of_rigid, tree=tree_to_json(tree), velocity_scale=stated["velocity_scale"]
-    )
-    parameters = RigidTreeParameters(
-        solution.inertias, solution.armature, solution.viscous, solution.coulomb, solution.offset
-    )
-    return direct_fit(description, of_rigid, parts, parameters)

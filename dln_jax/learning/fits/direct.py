@@ -129,7 +129,7 @@ def choose_offset(
     lean = without_offset(needs)
     if lean == needs:
         return description, needs, solution
-    scale, validation = np.asarray(torque_scale(parts.sets.train)), parts.sets.validation
+    scale, validation = torque_scale(parts.sets.train), parts.sets.validation
 
     def fitted(needs_of_trial: Needs) -> tuple[Any, np.ndarray]:
         own = {**description, "needs": needs_of_trial._asdict()}

@@ -1,7 +1,7 @@
 """Fits a tree of unknown kinematics to states and torques: search, refinement, and a final linear problem."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -18,18 +18,18 @@ from dln_jax.learning.kinematics.projection import (
     Program,
     Samples,
     Structure,
-    compiled,
     descend,
     design,
     inertias_of,
+    make_program,
 )
 from dln_jax.learning.kinematics.search import ALIKE, Search, Twin, count_agreeing, difference, search
-from dln_jax.learning.linear import design_chunks
+from dln_jax.learning.linear import design_chunks, weighted
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.models.trees import SerialTreeParameters, make_serial_tree
-from dln_jax.precision import quick_compilation
+from dln_jax.precision import compiled
 from dln_jax.solvers import least_squares
-from dln_jax.types import InputError, Needs, require_positive
+from dln_jax.types import InputError, JointVector, Needs, require_positive
 
 FINALISTS, NEAR = 3, 2.0
 """Largest number of local minima to refine and compare by validation, and largest ratio of their loss to the lowest."""
@@ -49,7 +49,7 @@ class TreeFit(NamedTuple):
     frames: Frames
     torque_mse: float
     """Mean over the fitted samples of the sum of squared errors over joints; (N m)² or N²."""
-    joint_mse: Float[np.ndarray, " d"]
+    joint_mse: JointVector
     """Mean squared error of every joint over the fitted samples, (N m)² or N²."""
     validation_error: float
     """`torque_mse` of the validation samples; NaN without any."""
@@ -117,8 +117,8 @@ def fit_tree(
     acceleration = acceleration if needs.gravity else 0.0
     structure = Structure(order, needs.joints, acceleration, needs.friction, velocity_scale)
     with jax.enable_x64(True):
-        scale = np.asarray(torque_scale(train))
-        program, columns = compiled(structure, ridge=ridge), _columns(structure)
+        scale = torque_scale(train)
+        program, columns = make_program(structure, ridge=ridge), _columns(structure)
         parts = [drawn(train, count, settings.seed) for count in (settings.samples, most_samples)]
         some, every = ((part.q, part.qd, part.qdd, part.tau) for part in parts)
         searched, twin, until, wanted = ([], 0), None, began + settings.seconds, settings
@@ -126,7 +126,8 @@ def fit_tree(
         def finished(descent: Descent) -> tuple[Descent, least_squares.LeastSquaresSolution, np.ndarray, np.ndarray]:
             """The refined descent, its linear solution, and its mean squared errors by joint on both sets."""
             state, unit = _refine(program, structure, descent, every, scale, settings)
-            solution = _solve(columns, state, unit, train, rank_tolerance)
+            rows = weighted(design_chunks(columns, state.frames, train, CHUNK), unit)
+            solution = least_squares.solve_chunks(rows, rank_tolerance=rank_tolerance, negligible=1e-12)
             trained, judged = (
                 _joint_errors(columns, state.frames, solution.x, part) for part in (train, validation or train)
             )
@@ -195,9 +196,9 @@ def _refine(
     structure: Structure,
     state: Descent,
     samples: Samples,
-    scale: Float[np.ndarray, " d"],
+    scale: JointVector,
     settings: Search,
-) -> tuple[Descent, Float[np.ndarray, " d"]]:
+) -> tuple[Descent, JointVector]:
     """Continues the descent on all samples, then with the joints' residual torques as units."""
     unit = scale
     for last in range(ROUNDS + 1):
@@ -207,19 +208,7 @@ def _refine(
     return state, unit
 
 
-def _solve(
-    columns: Callable, state: Descent, unit: Float[np.ndarray, " d"], data: Trajectories, rank_tolerance: float
-) -> least_squares.LeastSquaresSolution:
-    """Solves for the linear parameters of known frames on all data, by singular values."""
-
-    def equations() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for Phi, _, tau in design_chunks(columns, state.frames, data, CHUNK):
-            yield (Phi / unit[:, None]).reshape(-1, Phi.shape[-1]), (tau / unit).ravel()
-
-    return least_squares.solve_chunks(equations(), rank_tolerance=rank_tolerance, negligible=1e-12)
-
-
-def _joint_errors(columns: Callable, frames: Frames, linear: np.ndarray, data: Trajectories) -> Float[np.ndarray, " d"]:
+def _joint_errors(columns: Callable, frames: Frames, linear: np.ndarray, data: Trajectories) -> JointVector:
     chunks = design_chunks(columns, frames, data, CHUNK)
     return np.sum([np.sum((Phi @ linear - tau) ** 2, axis=0) for Phi, _, tau in chunks], axis=0) / len(data.tau)
 
@@ -230,7 +219,7 @@ def _columns(structure: Structure) -> Callable:
     def one(frames: Frames, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
         return design(structure, frames, q, qd, qdd), jnp.zeros_like(q)
 
-    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
+    return compiled(jax.vmap(one, in_axes=(None, 0, 0, 0)))
 
 
 def _parameters(structure: Structure, frames: Frames, linear: np.ndarray) -> SerialTreeParameters:

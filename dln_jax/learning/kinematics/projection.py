@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.learning.kinematics.frames import Frames, displace, free_directions
 from dln_jax.mechanics.trees.scanned import Skeleton, scanned_forces, scanned_regressor
-from dln_jax.precision import quick_compilation
+from dln_jax.precision import compiled
 from dln_jax.types import JointKind, Vector
 
 LENGTH = 0.3
@@ -161,7 +161,7 @@ Program = Callable[[Descent, Samples, Array], Descent]
 """(state, samples, scales of the joints' torques) -> the state after `CHUNK` iterations."""
 
 
-def compiled(structure: Structure, *, ridge: float) -> Program:
+def make_program(structure: Structure, *, ridge: float) -> Program:
     """Returns the program of a structure; it compiles once per number of samples."""
     places = free_directions(structure.parents, structure.joints)
     lengths = np.where(places % 6 < 3, 1.0, LENGTH)
@@ -185,7 +185,7 @@ def compiled(structure: Structure, *, ridge: float) -> Program:
     def iterate(state: Descent, samples: Samples, unit: Array) -> Descent:
         return lax.fori_loop(0, CHUNK, lambda _, state: iteration(state, samples, unit), state)
 
-    return jax.jit(iterate, compiler_options=quick_compilation())
+    return compiled(iterate)
 
 
 def descend(

@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -29,7 +28,7 @@ from dln_jax.learning.kinematics.frames import (
     turn_round,
 )
 from dln_jax.learning.kinematics.projection import LENGTH, Descent, Program, Samples, Structure, descend
-from dln_jax.types import require_positive, require_seed
+from dln_jax.types import JointVector, require_positive, require_seed
 
 WAVE = 8
 """Starts between two tests of agreement. It does not depend on the number of threads, so neither do the results."""
@@ -68,7 +67,7 @@ def search(
     structure: Structure,
     program: Program,
     samples: Samples,
-    unit: Float[np.ndarray, " d"],
+    unit: JointVector,
     settings: Search,
     *,
     until: float,

@@ -22,10 +22,10 @@ from dln_jax.data.splits import every, select
 from dln_jax.identification.excitation.design import CRITERIA, Design, make_designer, random_designs
 from dln_jax.identification.excitation.limits import MotionLimits
 from dln_jax.identification.excitation.task import make_task
-from dln_jax.identification.identify import identify, parameters_of
+from dln_jax.identification.identify import identify
 from dln_jax.identification.rigid_tree import choose_terms
 from dln_jax.learning.friction import Terms, fit_friction
-from dln_jax.learning.linear import fit_linear
+from dln_jax.learning.linear import fit_linear, parameters_of
 from dln_jax.learning.momentum import fit_momentum
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees.description import Tree, dh_frames, serial

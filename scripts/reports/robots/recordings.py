@@ -16,11 +16,11 @@ from dln_jax.data.encoders.filters import low_pass
 from dln_jax.data.encoders.smoothing import TRIMMED, smooth
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import in_blocks, label_indices, select, with_joints
-from dln_jax.identification.identify import identify, parameters_of
+from dln_jax.identification.identify import identify
 from dln_jax.identification.residual import fit_residual
 from dln_jax.learning.friction import fit_friction
 from dln_jax.learning.kinematics.fit import fit_tree
-from dln_jax.learning.linear import design, unravelled
+from dln_jax.learning.linear import design, parameters_of, unravelled
 from dln_jax.mechanics.trees.description import Tree, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 from dln_jax.metrics.predictions import cut_segments, predict_measured, valid_times
