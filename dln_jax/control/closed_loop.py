@@ -110,7 +110,7 @@ def simulate(
     controls: int,
     hardware: Hardware = Hardware(),  # noqa: B008
     key: Array | None = None,
-    substeps: int = 1,
+    substeps: int | None = 1,
     push: Push | None = None,
 ) -> ClosedLoopRun:
     """Simulates the closed loop from a state; traceable and differentiable.
@@ -124,70 +124,54 @@ def simulate(
         controls: m, number of controls.
         hardware: limits, noise, delay.
         key: random key of the noise; required if there is any.
-        substeps: integrator steps per sample.
+        substeps: integrator steps per sample; `None` if `field` is another simulator's (x, u) -> x a sample later.
         push: acts before the measurement of its sample; by default none.
 
     Raises:
         InputError: a setting is out of range, or there is noise without a key.
     """
     require_positive(seconds=seconds, rate=rate, controls=controls)
-    step, dt = integrated(field, 1.0 / rate, substeps=substeps), 1.0 / rate
-    start, act = sampled(controller, hardware, controls=controls, rate=rate, key=key)
+    delay, dt = hardware.delay, 1.0 / rate
+    if delay < 0 or delay != int(delay):
+        raise InputError(f"delay is {delay}; expected a whole number of samples, 0 or more")
+    if key is None and _noisy(hardware):
+        raise InputError("the hardware has noise; give a key of jax.random, a new one for each run")
+    key = jax.random.key(0) if key is None else key
+    step = field if substeps is None else integrated(field, dt, substeps=substeps)
     x = jnp.asarray(x, float)
 
-    def sample(carry: tuple[Array, Any], number: Array) -> tuple[tuple[Array, Any], tuple[Array, Array, Array]]:
-        x, loop = carry
+    def sample(carry: tuple[Array, Any, Array], number: Array) -> tuple[tuple[Array, Any, Array], tuple[Array, ...]]:
+        x, memory, queue = carry
         if push is not None:
             rates = jnp.where(number == round(push.seconds * rate), jnp.asarray(push.rates, x.dtype), 0.0)
             x = x.at[len(x) // 2 :].add(rates)
-        loop, u, y = act(loop, x, number)
-        x = step(x, u)
-        return (x, loop), (x, u, y)
-
-    samples = round(seconds * rate)
-    _, (later, u, y) = jax.lax.scan(sample, (x, start), jnp.arange(samples))
-    return ClosedLoopRun(dt * jnp.arange(samples + 1), jnp.concatenate([x[None], later]), u, y)
-
-
-def sampled(
-    controller: Controller, hardware: Hardware, *, controls: int, rate: float, key: Array | None
-) -> tuple[Any, Callable[[Any, Array, Array], tuple[Any, Array, Array]]]:
-    """Puts the hardware between a controller and any simulator of the plant.
-
-    Returns the initial memory, including the queue of delayed controls, and (memory, x, number of the sample) ->
-    (memory, acting controls, measurement). Raises `InputError` as `noise_of` does.
-    """
-    key = noise_of(hardware, key)
-
-    def act(carry: tuple[Any, Array], x: Array, number: Array) -> tuple[tuple[Any, Array], Array, Array]:
-        memory, queue = carry
         of_encoder, of_control = jax.random.split(jax.random.fold_in(key, number))
         y = measured(hardware, x, of_encoder)
         memory, command = controller.act(memory, number / rate, y)
         u, queue = delivered(hardware, queue, where_finite(command, y), of_control)
-        return (memory, queue), u, y
+        x = step(x, u)
+        return (x, memory, queue), (x, u, y)
 
-    return (controller.start, jnp.zeros((hardware.delay, controls))), act
-
-
-def noise_of(hardware: Hardware, key: Array | None) -> Array:
-    """Returns the key, or a default key; raises `InputError` for noise without a key, or an invalid delay."""
-    delay = hardware.delay
-    if delay < 0 or delay != int(delay):
-        raise InputError(f"delay is {delay}; expected a whole number of samples, 0 or more")
-    if _noisy(hardware) and key is None:
-        raise InputError("the hardware has noise; give a key of jax.random, a new one for each run")
-    return jax.random.key(0) if key is None else key
+    samples = round(seconds * rate)
+    start = x, controller.start, jnp.zeros((delay, controls))
+    _, (later, u, y) = jax.lax.scan(sample, start, jnp.arange(samples))
+    return ClosedLoopRun(dt * jnp.arange(samples + 1), jnp.concatenate([x[None], later]), u, y)
 
 
 def measured(hardware: Hardware, x: Array, key: Array) -> Array:
     """Returns the measurement of a state (q, qd) that the controller receives."""
     q, qd = jnp.split(x, 2)
-    if _noisy(hardware):
-        q = q + hardware.encoder_noise * jax.random.normal(key, q.shape, x.dtype)
-    step = jnp.asarray(hardware.encoder_step)
-    y = jnp.where(step > 0, step * jnp.round(q / jnp.where(step > 0, step, 1.0)), q)
+    y = encoded(hardware, q, jax.random.normal(key, q.shape, x.dtype) if _noisy(hardware) else None)
     return jnp.concatenate([y, qd]) if hardware.sees_rates else y
+
+
+def encoded(hardware: Hardware, q: Any, normal: Any) -> Any:
+    """Returns the encoders' readings of q [d] with a draw of the standard normal distribution, or with `None`."""
+    xp = np if isinstance(q, np.ndarray) else jnp
+    if normal is not None:
+        q = q + hardware.encoder_noise * normal
+    step = xp.asarray(hardware.encoder_step)
+    return xp.where(step > 0, step * xp.round(q / xp.where(step > 0, step, 1.0)), q)
 
 
 def delivered(hardware: Hardware, queue: Array, command: Array, key: Array) -> tuple[Array, Array]:

@@ -18,8 +18,7 @@ from jaxtyping import Float
 from dln_jax.control.closed_loop import ClosedLoopRun, Hardware, Outcomes, Push, hanging_starts, outcomes, simulate
 from dln_jax.control.energy_shaping import EnergyGains
 from dln_jax.control.plants.estimators import Estimator, by_differences
-from dln_jax.control.plants.plant import Layout, Plant, layout
-from dln_jax.control.plants.simulated import plant_of
+from dln_jax.control.plants.plant import Layout, Plant, layout, plant_of
 from dln_jax.control.state_space import field_of
 from dln_jax.control.swing_up import SwingUp, SwingUpNumbers, Upright, swing_up, upright_of
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics

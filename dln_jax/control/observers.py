@@ -1,15 +1,25 @@
-"""Controllers with incomplete measurements: rates from encoders, and the present state from late measurements."""
+"""Controllers with incomplete measurements: rates by differences of encoder readings, and states by Kalman filters.
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+A late measurement belongs to an earlier state. The memory of `with_estimate` holds the belief at the time of the most
+delayed channel, and the measurements and controls since then. At every sample the filter goes through them again, so
+that each measurement is used at its own time, and prompt channels at once. The law receives the state predicted for the
+moment at which its control begins to act.
+
+Samples of hardware are never exactly on time. The filter uses their own times: the prediction over a step of length
+(1 + e) h, h = 1 / rate, is x + (1 + e) (step(x) - x), with the error ½ e (1 + e) h² d²x/dt².
+"""
+
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float, Int
 
 from dln_jax.control.closed_loop import Controller, stateless
-from dln_jax.control.state_space import Law
+from dln_jax.control.estimate.kalman import Belief, Process, predict, update
+from dln_jax.control.state_space import Law, saturated
 from dln_jax.types import InputError, require_positive
 
 
@@ -47,63 +57,100 @@ def with_differences(law: Law | Controller, d: int, *, rate: float, cutoff: floa
     return Controller(((jnp.zeros(d), jnp.zeros(d), jnp.zeros(d), jnp.asarray(0)), controller.start), act)
 
 
-class Late(NamedTuple):
-    """Memory of a controller with prediction."""
-
-    inner: Any
-    """Memory of the inner controller."""
-    past: Float[Array, "max_delay m"]
-    """Past controls, newest first."""
-    first: Float[Array, " p"]
-    """First measurement."""
-    acted: Int[Array, ""]
-    """Samples since the first non-zero control, including its own; 0 before it."""
-    delay: Int[Array, ""]
-    """Current estimate of the measurements' delay in samples."""
-    moved: Bool[Array, ""]
-    """Whether motion was detected; the delay is fixed from then on."""
-    seen: Bool[Array, ""]
-
-
-def with_prediction(
-    controller: Controller,
-    step: Callable[[Array, Array], Array],
+def with_estimate(
+    law: Law | Controller,
+    process: Process,
+    belief: Belief,
     *,
-    states: int,
+    rate: float,
     controls: int,
-    max_delay: int,
-    threshold: float = 0.0,
+    lower: Any = -jnp.inf,
+    upper: Any = jnp.inf,
+    delay: int | float = 0,
+    late: Sequence[int] | int = 0,
+    every: Sequence[int] | int = 1,
 ) -> Controller:
-    """Wraps a controller for measurements that are late by an unknown number of samples: it acts on predictions.
-
-    The system starts at rest. Motion is first measured one sample plus the delay after the first non-zero control;
-    until then the state is predicted from rest with all controls so far. If the system moves before its controls can
-    explain it, the delay counts as zero.
+    """Gives a law the states that a Kalman filter estimates from measurements, instead of differences of readings.
 
     Args:
-        controller: takes measurements of the whole state [n].
-        step: (x, u) -> x a sample later, by a model.
-        states: n, number of states.
-        controls: m, number of controls.
-        max_delay: largest possible delay in samples.
-        threshold: smallest change of a measured coordinate that counts as motion, for example a few encoder steps.
+        law: x [n] -> u, or a controller with such measurements.
+        process: such as `mechanical(...)`.
+        belief: belief in the state before the first measurement.
+        rate: nominal sampling rate, Hz; the filter uses the times with which the controller is called.
+        controls: m.
+        lower: lower limits of the controls, which the filter must know.
+        upper: upper limits.
+        delay: samples after which a control begins to act; it need not be a whole number.
+        late: delays of the channels of y in samples, one per channel or one for all.
+        every: samples between new measurements of a channel, from the first sample on, one per channel or one for all;
+            values in between are ignored.
+
+    The memory of the controller begins with the estimate of the state [n] at the last sample.
 
     Raises:
-        InputError: a number is not positive.
+        InputError: a number of samples is negative, or not whole where it must be, or `every` or the rate is zero.
     """
-    require_positive(states=states, controls=controls, max_delay=max_delay)
+    require_positive(rate=rate, controls=controls)
+    if not 0 <= delay < jnp.inf:
+        raise InputError(f"delay is {delay}; expected a number of samples, 0 or more")
+    channels = len(process.measured(belief.x))
+    lag, period = _samples("late", late, channels, 0), _samples("every", every, channels, 1)
+    wait = int(delay)
+    share = float(delay) - wait
+    controller = law if isinstance(law, Controller) else stateless(law)
+    window = int(lag.max()) + 1
+    rows = window - 1 - lag, np.arange(channels)
 
-    def act(memory: Late, t: Array, y: Array) -> tuple[Late, Array]:
-        first = jnp.where(memory.seen, memory.first, y)
-        moved = memory.moved | (jnp.max(jnp.abs(y - first)) > threshold)
-        on_the_way = jnp.where(moved, memory.acted - 1, memory.acted)
-        delay = jnp.where(memory.moved, memory.delay, jnp.clip(on_the_way, 0, max_delay))
+    def acting(u: Array, lengths: Array) -> Array:
+        """Returns the mean controls over the steps of the window, and over those before the next control acts."""
+        lengths = jnp.concatenate([lengths, jnp.ones(wait, lengths.dtype)])
+        early = jnp.cumsum(jnp.append(0.0, 1 - lengths))
+        step = jnp.arange(window + wait)
+        before = jnp.clip((share + early[step + wait] - early[step]) / lengths[step + wait], 0, 1)[:, None]
+        return (1 - before) * u[1:] + before * u[:-1]
 
-        x = jax.lax.fori_loop(0, delay, lambda number, x: step(x, memory.past[delay - 1 - number]), y)
-        inner, u = controller.act(memory.inner, t, x)
-        acted = memory.acted + ((memory.acted > 0) | jnp.any(u != 0))
-        past = jnp.concatenate([u[None], memory.past[:-1]])
-        return Late(inner, past, first, acted, delay, moved, jnp.ones_like(moved)), u
+    def through(past: Belief, sample: tuple[Array, ...]) -> tuple[Belief, Belief]:
+        y, seen, u, number, length = sample
+        later = predict(process, past, u)
+        later = later._replace(x=past.x + length * (later.x - past.x))
+        # Before the first sample there was no motion to predict.
+        later = jax.tree.map(lambda new, old: jnp.where(number > 0, new, old), later, past)
+        after, _ = update(process, later, y, seen)
+        return after, after
 
-    zero, no, past = jnp.asarray(0), jnp.asarray(False), jnp.zeros((max_delay, controls))
-    return Controller(Late(controller.start, past, jnp.zeros(states), zero, zero, no, no), act)
+    def act(memory: tuple, t: Array, y: Array) -> tuple[tuple, Array]:
+        _, inner, past, (ys, seen, queue), (number, before, lengths) = memory
+        taken = number - jnp.asarray(lag)
+        fresh = (taken >= 0) & (taken % jnp.asarray(period) == 0)
+        ys = jnp.concatenate([ys, jnp.zeros((1, channels), y.dtype)]).at[rows].set(y)
+        seen = jnp.concatenate([seen, jnp.zeros((1, channels), bool)]).at[rows].set(fresh)
+        newest = jnp.where(number > 0, (t - before) * rate, 1.0).astype(ys.dtype)
+        lengths = jnp.append(lengths, newest)[1:]
+        known = acting(queue, lengths)
+        numbers = number - window + 1 + jnp.arange(window)
+        now, afterwards = jax.lax.scan(through, past, (ys, seen, known[:window], numbers, lengths[wait:]))
+
+        none = jnp.zeros_like(process.deviation(now.x, jnp.zeros(controls, now.x.dtype)))
+        ahead = now.x
+        for u in known[window:]:
+            ahead = process.step(ahead, u, none)
+        if share:
+            ahead += share * (process.step(ahead, queue[-1], none) - ahead)
+        inner, u = controller.act(inner, t, ahead)
+        u = saturated(u, lower, upper)
+        past = jax.tree.map(lambda leaf: leaf[0], afterwards)
+        recent = ys[1:], seen[1:], jnp.concatenate([queue[1:], u[None]])
+        return (now.x, inner, past, recent, (number + 1, jnp.asarray(t, ys.dtype), lengths)), u
+
+    zeros = lambda *shape: jnp.zeros(shape, belief.x.dtype)  # noqa: E731
+    unseen = jnp.zeros((window - 1, channels), bool)
+    recent = zeros(window - 1, channels), unseen, zeros(window + wait + 1, controls)
+    clock = jnp.asarray(0), zeros(), jnp.ones(window + wait, belief.x.dtype)
+    return Controller((belief.x, controller.start, belief, recent, clock), act)
+
+
+def _samples(name: str, value: Any, count: int, least: int) -> np.ndarray:
+    numbers = np.broadcast_to(np.asarray(value), (count,))
+    if not (np.equal(numbers, np.round(numbers)) & (numbers >= least)).all():
+        raise InputError(f"{name} is {value}; expected whole numbers of samples, {least} or more")
+    return numbers.astype(int)

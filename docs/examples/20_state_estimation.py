@@ -14,11 +14,8 @@ import numpy as np
 
 import dln_jax
 from dln_jax.control.closed_loop import Hardware, simulate
-from dln_jax.control.estimate.extended import extended
-from dln_jax.control.estimate.loop import filtered, with_estimate
-from dln_jax.control.estimate.process import belief, mechanical
-from dln_jax.control.estimate.unscented import unscented
-from dln_jax.control.observers import with_differences
+from dln_jax.control.estimate.kalman import belief, filtered, mechanical
+from dln_jax.control.observers import with_differences, with_estimate
 from dln_jax.control.regulators import lqr, regulated
 from dln_jax.control.state_space import field_of, linearise
 from dln_jax.figures import style
@@ -49,12 +46,10 @@ hardware = Hardware(-LIMIT, LIMIT, encoder_step=STEP, control_noise=2.5e-4, dela
 
 process = mechanical(plant, B, rate=RATE, band=[5e-4, 1e-5], encoder_step=STEP)
 prior = belief(goal, 0.1)
-filters = {"extended": extended(process), "unscented": unscented(process)}
+filters = {"extended": process, "unscented": process._replace(unscented=True)}
 controllers = {"differences": with_differences(law, 2, rate=RATE, cutoff=50.0)}
 for name, filter in filters.items():
-    controllers[name] = with_estimate(
-        law, filter, prior, lower=-LIMIT, upper=LIMIT, delay=1, controls=1, measurements=2
-    )
+    controllers[name] = with_estimate(law, filter, prior, rate=RATE, controls=1, lower=-LIMIT, upper=LIMIT, delay=1)
 
 # %%
 # The torque at the goal

@@ -10,7 +10,7 @@ from calls import one_line
 
 from dln_jax import tree_system
 from dln_jax.control.closed_loop import Hardware, simulate, stateless
-from dln_jax.control.mujoco_loop import simulate_in_mujoco
+from dln_jax.control.plants.mujoco_plants import simulate_in_mujoco
 from dln_jax.control.state_space import field_of
 from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import Robot

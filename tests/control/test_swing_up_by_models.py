@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.control.closed_loop import outcomes
 from dln_jax.control.desktop_plants import desktop_plant, law_of, model_of_plant, nominal_model, try_starts
-from dln_jax.control.estimate.process import mechanical
+from dln_jax.control.estimate.kalman import mechanical
 from dln_jax.control.plants.estimators import by_filter
 from dln_jax.control.swing_up import nearest_equilibrium, swing_up
 from dln_jax.mechanics.dynamics import PlainDynamics

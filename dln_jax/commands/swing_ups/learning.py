@@ -82,7 +82,7 @@ def learn_to_swing_up(
     fitted = identified_chain(prepared, plant.layout.needs)
     noise = np.asarray(noise_of(recording.q, recording.trajectory), float)
     B = plant.layout.actuation
-    process = from_log(fitted.dynamics, recording, actuation=B, delay=prepared.delay).process
+    process = from_log(fitted.dynamics, recording, actuation=B, delay=prepared.delay)
     band = np.asarray(process.disturbance)
     # What the model does not explain of the driven joints acts as noise of the motors in the trials.
     hardware = Hardware(encoder_noise=noise, control_noise=np.linalg.pinv(B) @ band, delay=int(prepared.delay))

@@ -188,7 +188,7 @@ def of_desktop(desk: DesktopPlant, layout: Layout, options: Any, folder: Path) -
         print(f"learned: controls {late:.3g} sample(s) late, q filtered at {obtained.prepared.cutoff:.3g} Hz")
     torque, acceleration = errors_along(desk, model, test_motions(desk, seed=seed))
     filtered = options.estimator != "differences"
-    process = from_log(model, recording, actuation=B, delay=late).process if filtered else None
+    process = from_log(model, recording, actuation=B, delay=late) if filtered else None
     measured = estimator = estimator_of(options.estimator, layout, process, delay=late)
     law = law_of(desk, model, measured)
     if options.recover == "plans":

@@ -12,7 +12,7 @@ from jax import Array
 from dln_jax.control.optimal.own_plants import OwnProblem, own_problem
 from dln_jax.control.optimal.plants import ValuePlant
 from dln_jax.control.optimal.problem import from_field, rates
-from dln_jax.control.plants.mujoco_plants import layout_of_file
+from dln_jax.control.plants.mujoco_plants import mujoco_plant
 from dln_jax.control.plants.plant import Layout, layout
 from dln_jax.control.plants.postures import extremes
 from dln_jax.control.state_space import Field, field_of
@@ -31,10 +31,10 @@ def of_file(path: Path, actuated: Sequence[str] = (), control: Any = None, goal:
     """The tree of rigid bodies of an MJCF or URDF file with viscous friction, its layout, and what it lacks.
 
     Raises:
-        InputError: raised by `read_robot` and `layout_of_file`.
+        InputError: raised by `read_robot` and `mujoco_plant`.
     """
     robot = read_robot(path)
-    known = layout_of_file(path, actuated, control=control, goal=goal)
+    known = mujoco_plant(path, actuated, control=control, goal=goal, passive=False).layout
     needs = robot.tree.needs._replace(actuation=tuple(map(tuple, known.actuation.tolist())))
     viscous = bool(robot.damping.any())
     if viscous:

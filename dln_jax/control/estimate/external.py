@@ -10,13 +10,15 @@ held and the trapezoidal rule for beta = dL/dq - friction,
 
     r <- r + (1 - exp(-gain dt)) ((p' - p) / dt - tau - (beta + beta') / 2 - r)
 
-A push shows when r leaves the band of the model's own errors. The score of a sample is the largest |r_i| / band_i;
-`contact_threshold` finds the score that motions without contact exceed only as often as allowed.
+A push shows when r leaves the band of the model's own errors. The score of a sample is the largest |r_i| / band_i, with
+the standard deviation band_i of r without contact: the model's torque band, for example `Run.torque_std` at this state,
+or the root mean square of r in motions without contact. `contact_threshold` finds the score that motions without
+contact exceed only as often as allowed.
 """
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -34,26 +36,11 @@ LEAST_BLOCKS = 20
 """Fewest blocks for a fit."""
 
 
-class Momentum(NamedTuple):
-    """Memory of a momentum observer."""
-
-    r: Float[Array, " d"]
-    """Estimate of the external torques, N m or N."""
-    p: Float[Array, " d"]
-    beta: Float[Array, " d"]
-    begun: Bool[Array, ""]
-    """Whether there was an earlier sample."""
+Observer = tuple[Any, Callable[[Any, Vector, Vector, Vector], tuple[Any, Array]]]
+"""First memory, and (memory, q, qd, tau held since the previous sample) -> (memory, r at this sample); pure."""
 
 
-class MomentumObserver(NamedTuple):
-    """An observer of external torques; pure."""
-
-    start: Momentum
-    update: Callable[[Momentum, Vector, Vector, Vector], Momentum]
-    """(memory, q, qd, tau held since the previous sample) -> memory with r at this sample."""
-
-
-def momentum_observer(model: Dynamics | PlainDynamics, d: int, *, rate: float, gain: Any) -> MomentumObserver:
+def momentum_observer(model: Dynamics | PlainDynamics, d: int, *, rate: float, gain: Any) -> Observer:
     """Returns a momentum observer of a natural system.
 
     Args:
@@ -75,37 +62,24 @@ def momentum_observer(model: Dynamics | PlainDynamics, d: int, *, rate: float, g
     def lagrangian(q: Vector, qd: Vector) -> Scalar:
         return model.energy(q, qd) - 2 * model.energy(q, jnp.zeros_like(qd))
 
-    def update(memory: Momentum, q: Vector, qd: Vector, tau: Vector) -> Momentum:
+    def update(memory: tuple, q: Vector, qd: Vector, tau: Vector) -> tuple[tuple, Array]:
+        r, p_before, beta_before, begun = memory
         p = model.mass_matrix(q) @ qd
         beta = jax.grad(lagrangian)(q, qd) - model.friction(q, qd)
-        external = (p - memory.p) * rate - tau - (beta + memory.beta) / 2
-        r = jnp.where(memory.begun, memory.r + share * (external - memory.r), memory.r)
-        return Momentum(r, p, beta, jnp.ones_like(memory.begun))
+        external = (p - p_before) * rate - tau - (beta + beta_before) / 2
+        r = jnp.where(begun, r + share * (external - r), r)
+        return (r, p, beta, jnp.ones_like(begun)), r
 
-    return MomentumObserver(Momentum(jnp.zeros(d), jnp.zeros(d), jnp.zeros(d), jnp.asarray(False)), update)
+    return (jnp.zeros(d), jnp.zeros(d), jnp.zeros(d), jnp.asarray(False)), update
 
 
-def observed(observer: MomentumObserver, q: Any, qd: Any, tau: Any) -> Float[Array, "N d"]:
+def observed(observer: Observer, q: Any, qd: Any, tau: Any) -> Float[Array, "N d"]:
     """Returns the external torques r along a log of q, qd and tau [N, d], with tau[k] held from k to k + 1; pure."""
-    q, qd, tau = (jnp.asarray(column) for column in (q, qd, tau))
+    start, update = observer
+    tau = jnp.asarray(tau)
     held = jnp.concatenate([jnp.zeros_like(tau[:1]), tau[:-1]])
-
-    def sample(memory: Momentum, row: tuple[Array, Array, Array]) -> tuple[Momentum, Array]:
-        memory = observer.update(memory, *row)
-        return memory, memory.r
-
-    return jax.lax.scan(sample, observer.start, (q, qd, held))[1]
-
-
-def contact_score(r: Vector, band: Any) -> Scalar:
-    """Returns the largest |r_i| / band_i; a contact is a score above the threshold.
-
-    Args:
-        r: external torques.
-        band: standard deviation of r without contact [d]: the model's torque band, for example `Run.torque_std` at this
-            state, or the root mean square of r in motions without contact.
-    """
-    return jnp.max(jnp.abs(r) / jnp.asarray(band))
+    rows = jnp.asarray(q), jnp.asarray(qd), held
+    return jax.lax.scan(lambda memory, row: update(memory, *row), start, rows)[1]
 
 
 def contact_threshold(scores: Any, *, rate: float, false_alarms: float) -> float:
@@ -153,21 +127,14 @@ def block_maxima(scores: Any, *, rate: float) -> Float[np.ndarray, " B"]:
     return np.concatenate([part.max(axis=1) for part in whole]) if whole else np.zeros(0)
 
 
-class Wrench(NamedTuple):
-    """Force and moment of the environment on a flange, in the ground frame."""
+def flange_wrench(
+    jacobian: Any, tau: Any, *, length: float = 0.1, smallest: float = 1e-3
+) -> tuple[Float[Array, " 6"], Bool[Array, ""], Scalar]:
+    """Returns the wrench F at a flange as the least-squares solution of Jᵀ F = tau, in the ground frame.
 
-    force: Float[Array, " 3"]
-    """N."""
-    moment: Float[Array, " 3"]
-    """About the flange's point, N m."""
-    determined: Bool[Array, ""]
-    """Whether the torques determine all six components; otherwise this is the shortest wrench that explains them."""
-    residual: Scalar
-    """Norm of the torques that no wrench at the flange explains, N m or N: a contact elsewhere."""
-
-
-def flange_wrench(jacobian: Any, tau: Any, *, length: float = 0.1, smallest: float = 1e-3) -> Wrench:
-    """Returns the least-squares solution of Jᵀ F = tau for the wrench F.
+    The first three components are the force, N, the others the moment about the flange's point, N m. The second result
+    tells whether the torques determine all six of them; otherwise this is the shortest wrench that explains them. The
+    third is the norm of the torques that no wrench at the flange explains, N m or N: a contact elsewhere.
 
     Args:
         jacobian: Jacobian of the flange's linear and angular velocity [6, d], by `mechanics.trees.frame_jacobian`.
@@ -183,4 +150,4 @@ def flange_wrench(jacobian: Any, tau: Any, *, length: float = 0.1, smallest: flo
     along = vectors.T @ (scaled @ tau)
     wrench = scale * (vectors @ jnp.where(counts, along / jnp.where(counts, values, 1.0), 0.0))
     left = tau - jacobian.T @ wrench
-    return Wrench(wrench[:3], wrench[3:], jnp.all(counts), jnp.sqrt(left @ left))
+    return wrench, jnp.all(counts), jnp.sqrt(left @ left)

@@ -27,8 +27,7 @@ from dln_jax.control.optimal.action_costs import centred, limited_atan, stretche
 from dln_jax.control.optimal.fitted import Iteration
 from dln_jax.control.optimal.plants import MARGIN, Evaluation, Starts, ValuePlant, ValueSettings
 from dln_jax.control.optimal.problem import ControlProblem, checked, from_plant
-from dln_jax.control.plants.plant import Layout
-from dln_jax.control.plants.simulated import ACTIVE_SPREAD, SPREAD
+from dln_jax.control.plants.plant import ACTIVE_SPREAD, SPREAD, Layout
 from dln_jax.control.state_space import field_of, holding_controls
 from dln_jax.control.swing_up import nearest_equilibrium
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics

@@ -1,16 +1,12 @@
 """Turns controllers of states into controllers of measurements, for the plants of a layout."""
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 
 from dln_jax.control.closed_loop import Controller
-from dln_jax.control.estimate.extended import extended
-from dln_jax.control.estimate.loop import with_estimate
-from dln_jax.control.estimate.process import Filter, Process, belief
-from dln_jax.control.estimate.unscented import unscented
-from dln_jax.control.observers import with_differences
+from dln_jax.control.estimate.kalman import Process, belief
+from dln_jax.control.observers import with_differences, with_estimate
 from dln_jax.control.plants.plant import Layout
 from dln_jax.control.state_space import Law
 from dln_jax.types import InputError
@@ -19,8 +15,7 @@ Estimator = Callable[[Law | Controller], Controller]
 """Law or controller of (q, qd) -> controller of measurements of q."""
 FASTEST_FILTER = 50.0
 """Largest cut-off frequency for differences, Hz; it is also at most a quarter of the sampling rate."""
-FILTERS: Mapping[str, Callable[[Process], Filter]] = {"extended": extended, "unscented": unscented}
-ESTIMATORS = (*FILTERS, "differences")
+ESTIMATORS = "extended", "unscented", "differences"
 """Names of `estimator_of`."""
 UNSURE = 1.0
 """Standard deviation of the first estimate: of coordinates in rad or m, and of rates in 1/s or m/s."""
@@ -38,22 +33,20 @@ def by_differences(layout: Layout) -> Estimator:
     return lambda law: with_differences(law, len(layout.joints), rate=layout.rate, cutoff=cutoff)
 
 
-def by_filter(
-    layout: Layout, process: Process, *, delay: int | float = 0, make: Callable[[Process], Filter] = extended
-) -> Estimator:
+def by_filter(layout: Layout, process: Process, *, delay: int | float = 0) -> Estimator:
     """Returns an estimator of the states by a filter of the measurements, which uses their times.
 
     Args:
         layout: layout of the plant.
         process: such as that of `estimate.from_log`.
         delay: samples after which a control begins to act.
-        make: process -> filter, such as `estimate.unscented`.
     """
     lower, upper = layout.limits.control.T
     d, m = layout.actuation.shape
     start = belief(np.concatenate([layout.hanging, np.zeros(d)]), np.full(2 * d, UNSURE))
-    settings: Any = {"controls": m, "measurements": d, "lower": lower, "upper": upper, "delay": delay}
-    return lambda law: with_estimate(law, make(process), start, rate=layout.rate, **settings)
+    return lambda law: with_estimate(
+        law, process, start, rate=layout.rate, controls=m, lower=lower, upper=upper, delay=delay
+    )
 
 
 def estimator_of(name: str, layout: Layout, process: Process | None, *, delay: int | float) -> Estimator:
@@ -73,4 +66,4 @@ def estimator_of(name: str, layout: Layout, process: Process | None, *, delay: i
         return by_differences(layout)
     if process is None:
         raise InputError(f"the filter {name!r} needs a process, such as that of estimate.from_log")
-    return by_filter(layout, process, delay=delay, make=FILTERS[name])
+    return by_filter(layout, process._replace(unscented=name == "unscented"), delay=delay)

@@ -22,10 +22,9 @@ from dln_jax.control.closed_loop import Controller
 from dln_jax.control.energy_shaping import energy_shaping
 from dln_jax.control.plants.estimators import by_differences
 from dln_jax.control.plants.planned import READY, followed, follower, plans_of
-from dln_jax.control.plants.plant import Layout, Plant
+from dln_jax.control.plants.plant import Layout, Plant, spread_of
 from dln_jax.control.plants.runs import PlantRun, compiled, distances, run
 from dln_jax.control.plants.scales import USUAL, Scales, circle, gains_of, scales_of, swing_up_numbers
-from dln_jax.control.plants.simulated import spread_of
 from dln_jax.control.swing_up import Upright, upright_of
 from dln_jax.data.encoders.filters import low_pass
 from dln_jax.data.schema import Trajectories

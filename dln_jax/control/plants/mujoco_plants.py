@@ -4,16 +4,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
+from jax import Array
 
-from dln_jax.control.closed_loop import Hardware
-from dln_jax.control.mujoco_loop import advance, sampling
-from dln_jax.control.plants.plant import Layout, Plant, layout
+from dln_jax.control.closed_loop import ClosedLoopRun, Controller, Hardware, simulate
+from dln_jax.control.plants.plant import Plant, layout, simulated
 from dln_jax.control.plants.postures import extremes
-from dln_jax.control.plants.simulated import simulated
 from dln_jax.data.robot_xml import driven_joints, parse_robot, velocity_limits
 from dln_jax.data.robots import Robot, compile_robot, compiled_model, joint_names, quiet, require_ranges, robot_of
-from dln_jax.types import InputError
+from dln_jax.types import InputError, require_positive
 
 MOST_JOINTS = 4
 
@@ -27,6 +27,7 @@ def mujoco_plant(
     hanging: Any = None,
     rate: float | None = None,
     speed: Any = None,
+    passive: bool = True,
     hardware: Hardware = Hardware(),  # noqa: B008
     seed: int = 0,
 ) -> Plant:
@@ -45,6 +46,7 @@ def mujoco_plant(
         hanging: posture of rest [d]; by default the lowest one.
         rate: sampling rate, Hz; by default one sample per time step.
         speed: largest rates, one or [d]; by default those of a URDF, as MJCF cannot state them.
+        passive: whether a joint without a motor is required, as for a swing-up.
         hardware: noise, resolution and delay.
         seed: seed of the starts and the noise.
 
@@ -54,65 +56,19 @@ def mujoco_plant(
             passive joint, or gravity does not move a passive joint; bodies touch at the goal or hanging; a sample is
             not a whole number of steps.
     """
-    mujoco, model, data, controls, described, steps = _described(
-        source, actuated, control, goal, rate, hanging, speed, passive=True
-    )
-    B = described.actuation
-    applied = np.where(controls.any(axis=0)[:, None], 0.0, B)
-
-    def begin(q: np.ndarray) -> None:
-        mujoco.mj_resetData(model, data)
-        data.qpos[:] = q
-
-    def act(u: np.ndarray) -> None:
-        data.ctrl[:] = controls @ B @ u
-        data.qfrc_applied[:] = applied @ u
-        advance(mujoco, model, data, steps)
-
-    def kick(rates: np.ndarray) -> None:
-        data.qvel[:] += rates
-
-    return simulated(described, begin, lambda: data.qpos, act, kick=kick, hardware=hardware, seed=seed)
-
-
-def layout_of_file(
-    path: Path,
-    actuated: Sequence[int | str] = (),
-    *,
-    control: Any = None,
-    goal: Any = None,
-    rate: float | None = None,
-) -> Layout:
-    """Returns the layout of an MJCF or URDF file, whose joints may all have a motor; arguments as `mujoco_plant`."""
-    return _described(path, actuated, control, goal, rate)[4]
-
-
-def _described(
-    source: Any,
-    actuated: Sequence[int | str],
-    control: Any,
-    goal: Any,
-    rate: float | None,
-    hanging: Any = None,
-    speed: Any = None,
-    passive: bool = False,
-) -> tuple[Any, Any, Any, np.ndarray, Layout, int]:
-    """Returns MuJoCo, its model, its data, controls of the file's actuators per force of a joint [nu, d], the layout of
-    the plant, and the number of time steps in a sample."""
     mujoco, model, speeds, transmissions = _model(source)
     names = joint_names(model)
-    speed = [speeds.get(name, np.inf) for name in names] if speed is None else speed
     for name, kind in zip(names, model.jnt_type, strict=True):
         if kind in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)):
             raise InputError(f"joint '{name}' is neither a hinge nor a slide; expected a plant with such joints only")
     if not 1 + passive <= len(names) <= MOST_JOINTS:
         which = f"2 to {MOST_JOINTS}, one of them passive" if passive else f"1 to {MOST_JOINTS}"
         raise InputError(f"the plant has {len(names)} joint(s); expected {which}")
-    per_second, steps = sampling(model, rate)
+    rate, steps = _sampling(model, rate)
     robot = robot_of(model, {})
     _require_known_forces(mujoco, model)
     joints, ranges = robot.tree.joints, robot.position_limits
-    controls, largest = _motors(mujoco, model, robot)
+    controls, largest = _motors(model, robot)
     stated = actuated if len(actuated) else [name for name in transmissions if name in names]
     driven = _numbers(stated, names) if len(stated) else np.flatnonzero(controls.any(axis=0)).tolist()
     if not driven:
@@ -121,8 +77,16 @@ def _described(
             "(--actuated)"
         )
     data = mujoco.MjData(model)
+
+    def potential(q: np.ndarray) -> float:
+        data.qpos[:] = q
+        with quiet(mujoco):
+            mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_energyPos(model, data)
+        return float(data.energy[0])
+
     if goal is None or hanging is None:
-        lowest, highest = extremes(lambda q: _potential(mujoco, model, data, q), joints, driven, ranges)
+        lowest, highest = extremes(potential, joints, driven, ranges)
         goal = highest if goal is None else goal
         if hanging is None:
             hanging = lowest
@@ -140,23 +104,126 @@ def _described(
                     "or an actuatorfrcrange"
                 )
         control = largest[driven]
-    described = layout(
-        joints, driven, goal=goal, hanging=hanging, rate=per_second, control=control, position=ranges, speed=speed,
-        names=names, passive=passive,
+    known = layout(
+        joints, driven, goal=goal, hanging=hanging, rate=rate, control=control, position=ranges,
+        speed=[speeds.get(name, np.inf) for name in names] if speed is None else speed, names=names, passive=passive,
     )  # fmt: skip
-    for k, asked in zip(driven, described.limits.control[:, 1], strict=True):
+    for k, asked in zip(driven, known.limits.control[:, 1], strict=True):
         if asked > largest[k]:
             raise InputError(
                 f"control is {asked:g}; the file limits the motor of joint '{names[k]}' to {largest[k]:g} N m or N"
             )
-    for where, q in (("at the goal", described.goal), ("where the plant hangs", described.hanging)):
-        _potential(mujoco, model, data, q)
+    for where, q in (("at the goal", known.goal), ("where the plant hangs", known.hanging)):
+        potential(q)
         for pair in data.contact.geom[data.contact.dist < 0][:1]:
             first, second = (model.body(body).name or body for body in model.geom_bodyid[pair])
             raise InputError(
                 f"bodies '{first}' and '{second}' touch {where}; exclude their contact, or move them apart"
             )
-    return mujoco, model, data, controls, described, steps
+    B = known.actuation
+    applied = np.where(controls.any(axis=0)[:, None], 0.0, B)
+
+    def begin(q: np.ndarray) -> None:
+        mujoco.mj_resetData(model, data)
+        data.qpos[:] = q
+
+    def act(u: np.ndarray) -> None:
+        data.ctrl[:] = controls @ B @ u
+        data.qfrc_applied[:] = applied @ u
+        _advance(mujoco, model, data, steps)
+
+    def kick(rates: np.ndarray) -> None:
+        data.qvel[:] += rates
+
+    return simulated(known, begin, lambda: data.qpos, act, kick=kick, hardware=hardware, seed=seed)
+
+
+def simulate_in_mujoco(
+    model: Any,
+    controller: Controller,
+    x: Any,
+    *,
+    seconds: float,
+    rate: float,
+    actuation: Any = None,
+    hardware: Hardware = Hardware(),  # noqa: B008
+    key: Array | None = None,
+) -> ClosedLoopRun:
+    """Runs `simulate` with MuJoCo's integrator and time step, which share no equations with this library.
+
+    After a control that is not finite, or if MuJoCo warns of divergence, everything is NaN. The plant is any model with
+    hinges and slides; not differentiable.
+
+    Args:
+        model: the text of an MJCF file, for example of a tree from `data.robot_files.mjcf`, or a `mujoco.MjModel`.
+        controller: called once per sample.
+        x: initial (q, qd) [2 d], in MuJoCo's order of joints.
+        seconds: duration of the run.
+        rate: sampling rate, Hz; a sample is a whole number of MuJoCo's time steps.
+        actuation: matrix [actuators, m] in ctrl = actuation u; by default u is ctrl.
+        hardware: limits, noise, delay; the model's own limits also apply.
+        key: random key of the noise; required if there is any.
+
+    Raises:
+        InputError: MuJoCo is missing or refuses the model; a joint is neither a hinge nor a slide; x has another size;
+            the time step is not positive and finite; a sample is not a whole number of steps; or as for `simulate`.
+    """
+    require_positive(seconds=seconds, rate=rate)
+    mujoco, model = compiled_model(model)
+    if model.nq != model.nv or np.shape(x) != (2 * model.nv,):
+        raise InputError(
+            f"x has shape {np.shape(x)} for {model.nv} degrees of freedom; expected hinges, slides and [2 d]"
+        )
+    _, steps = _sampling(model, rate)
+    B = np.eye(model.nu) if actuation is None else np.asarray(actuation, float)
+    data, last = mujoco.MjData(model), [np.zeros(0)]
+
+    def advanced(x: Any, u: Any) -> np.ndarray:
+        x, control = np.asarray(x), B @ np.asarray(u)
+        # MuJoCo continues its own state, which is more than x, such as the start of its solver; another x begins anew.
+        if not np.array_equal(x, last[0]):
+            mujoco.mj_resetData(model, data)
+            data.qpos[:], data.qvel[:] = np.split(x, 2)
+        # MuJoCo replaces values that are not finite, and resets when it diverges: both would hide a failure.
+        finite = np.isfinite(control).all() and np.isfinite(x).all()
+        if finite:
+            data.ctrl[:] = control
+            _advance(mujoco, model, data, steps)
+        after = np.concatenate([data.qpos, data.qvel])
+        last[0] = np.where(finite and np.isfinite(after).all(), after, np.nan).astype(x.dtype)
+        return last[0]
+
+    def step(x: Array, u: Array) -> Array:
+        return jax.pure_callback(advanced, jax.ShapeDtypeStruct(x.shape, x.dtype), x, u, vmap_method="sequential")
+
+    return simulate(
+        step, controller, x, seconds=seconds, rate=rate, controls=B.shape[1], hardware=hardware, key=key, substeps=None
+    )
+
+
+def _advance(mujoco: Any, model: Any, data: Any, steps: int) -> None:
+    """Advances MuJoCo's data by some time steps; the positions become NaN if it diverges."""
+    with quiet(mujoco):
+        mujoco.mj_step(model, data, steps)
+    bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+    if any(data.warning[kind].number for kind in bad):
+        data.qpos[:] = np.nan
+
+
+def _sampling(model: Any, rate: float | None = None) -> tuple[float, int]:
+    """Returns the rate of the samples, Hz, by default one per time step, and the number of time steps in a sample.
+
+    Raises:
+        InputError: the time step is not positive and finite, or a sample is not a whole number of steps.
+    """
+    step = float(model.opt.timestep)
+    if not 0 < step < np.inf:
+        raise InputError(f"the time step of the model is {step:g} s; expected a positive, finite one")
+    rate = float(1 / step if rate is None else rate)
+    steps = 1 / rate / step
+    if not 0.5 < steps < np.inf or abs(steps - round(steps)) > 1e-6:
+        raise InputError(f"a sample has {steps:.4g} steps of {step:g} s; expected a whole number")
+    return rate, round(steps)
 
 
 def _require_known_forces(mujoco: Any, model: Any) -> None:
@@ -200,7 +267,7 @@ def _numbers(actuated: Sequence[int | str], names: Sequence[str]) -> list[int]:
     return sorted(set(chosen))
 
 
-def _motors(mujoco: Any, model: Any, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+def _motors(model: Any, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """Returns controls of the actuators per force of a joint [nu, d], and the largest forces [d], infinite for none.
 
     Raises:
@@ -236,11 +303,3 @@ def _motors(mujoco: Any, model: Any, robot: Robot) -> tuple[np.ndarray, np.ndarr
                     )
                 largest[joint] = min(largest[joint], scale * min(-low, high))
     return controls, largest
-
-
-def _potential(mujoco: Any, model: Any, data: Any, q: np.ndarray) -> float:
-    data.qpos[:] = q
-    with quiet(mujoco):
-        mujoco.mj_fwdPosition(model, data)
-    mujoco.mj_energyPos(model, data)
-    return float(data.energy[0])

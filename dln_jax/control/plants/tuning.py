@@ -24,10 +24,9 @@ from jax import Array
 from dln_jax.control.closed_loop import Controller, Hardware, simulate
 from dln_jax.control.plants.estimators import Estimator, by_differences
 from dln_jax.control.plants.guarded import SPAN
-from dln_jax.control.plants.plant import Layout
+from dln_jax.control.plants.plant import Layout, spread_of
 from dln_jax.control.plants.runs import HELD, TOLERANCE
 from dln_jax.control.plants.scales import circle, scales_of
-from dln_jax.control.plants.simulated import spread_of
 from dln_jax.control.plants.ways import RECOVERIES, Way, require_recovery
 from dln_jax.control.regulators import Regulator
 from dln_jax.control.state_space import error

@@ -8,10 +8,9 @@ import numpy as np
 
 from dln_jax.control.closed_loop import Controller, stateless
 from dln_jax.control.plants.planned import followed, follower, plans_of
-from dln_jax.control.plants.plant import Layout
+from dln_jax.control.plants.plant import Layout, spread_of
 from dln_jax.control.plants.recovery import recovering
 from dln_jax.control.plants.scales import RANGES, Scales, swing_up_numbers
-from dln_jax.control.plants.simulated import spread_of
 from dln_jax.control.regulators import Regulator
 from dln_jax.control.swing_up import Upright, law_at
 from dln_jax.types import InputError

@@ -16,11 +16,11 @@ import numpy as np
 from dln_jax import joint_dissipation, tree_system
 from dln_jax.control.closed_loop import Hardware, following, outcomes
 from dln_jax.control.desktop_plants import desktop_plant, law_of, nominal_model
-from dln_jax.control.mujoco_loop import simulate_in_mujoco
 from dln_jax.control.observers import with_differences
 from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.control.optimal.problem import hjb_policy
 from dln_jax.control.optimal.value_networks import value_network
+from dln_jax.control.plants.mujoco_plants import simulate_in_mujoco
 from dln_jax.control.regulators import regulated
 from dln_jax.control.state_space import field_of, integrated
 from dln_jax.control.tracking import Gains, Reference, computed_torque, feed_forward, feedback, judged, trusted

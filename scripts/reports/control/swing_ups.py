@@ -32,7 +32,6 @@ from dln_jax.control.desktop_plants import (
     try_starts,
 )
 from dln_jax.control.estimate.tuning import from_log
-from dln_jax.control.estimate.unscented import unscented
 from dln_jax.control.plants.estimators import by_differences, by_filter
 from dln_jax.control.regulators import sampled_lqr
 from dln_jax.control.shooting import optimise
@@ -109,7 +108,7 @@ def estimates(*, plant: str, model: str, starts: int = 100) -> Numbers:
     recording, layout, delay = recorded(desk, seconds=30.0, seed=0), desk.layout, desk.hardware.delay
     lower, upper, last = desk.hardware.lower, desk.hardware.upper, round(2.0 * desk.rate)
     system = obtain(desk, model, recording, seed=0).dynamics
-    process = from_log(system, recording, actuation=layout.actuation, delay=delay).process
+    process = from_log(system, recording, actuation=layout.actuation, delay=delay)
     law, field = law_of(desk, system).law, field_of(model_of_plant(desk), layout.actuation)
     step = integrated(field, 1 / desk.rate, substeps=desk.substeps)
 
@@ -136,7 +135,7 @@ def estimates(*, plant: str, model: str, starts: int = 100) -> Numbers:
     estimators: dict[str, Callable[..., Controller]] = {
         "differences": by_differences(layout),
         "extended": by_filter(layout, process, delay=delay),
-        "unscented": by_filter(layout, process, delay=delay, make=unscented),
+        "unscented": by_filter(layout, process._replace(unscented=True), delay=delay),
         "exact-state": foreseeing,
     }
     x, keys = hanging_starts(starts, 0, position=desk.position), jax.random.split(jax.random.key(0), starts)

@@ -9,10 +9,8 @@ from numpy.testing import assert_allclose
 
 import dln_jax
 from dln_jax.control.closed_loop import Controller, stateless
-from dln_jax.control.estimate.extended import extended
-from dln_jax.control.estimate.loop import filtered, with_estimate
-from dln_jax.control.estimate.process import belief, mechanical
-from dln_jax.control.estimate.unscented import unscented
+from dln_jax.control.estimate.kalman import belief, filtered, mechanical
+from dln_jax.control.observers import with_estimate
 from dln_jax.control.state_space import field_of, integrated
 from dln_jax.export.c.interface import stated_costs
 from dln_jax.export.c.load import load_c
@@ -32,7 +30,7 @@ IDLE = stateless(lambda x: 0.0 * x[:1])
 
 
 def estimating(law, process=PROCESS, prior=PRIOR, **settings):
-    return with_estimate(law, extended(process), prior, controls=1, measurements=2, **settings)
+    return with_estimate(law, process, prior, **{"rate": 100.0, "controls": 1, **settings})
 
 
 def replay(controller):
@@ -40,7 +38,7 @@ def replay(controller):
 
     def sample(memory, row):
         memory, u = controller.act(memory, *row)
-        return memory, (memory.x, u)
+        return memory, (memory[0], u)
 
     run = jax.jit(lambda t, y: jax.lax.scan(sample, controller.start, (t, y))[1])
     return lambda y, t=None: run(np.arange(len(y)) / 100.0 if t is None else t, y)
@@ -54,7 +52,7 @@ def measurements(samples=60):
 
 def test_late_and_rare_measurements_give_the_estimates_of_a_filter_that_knows_their_times():
     y = measurements()
-    direct = jax.jit(lambda seen: filtered(extended(PROCESS), PRIOR, y, jnp.zeros((len(y), 1)), seen)[0])
+    direct = jax.jit(lambda seen: filtered(PROCESS, PRIOR, y, jnp.zeros((len(y), 1)), seen)[0])
     shifted = jnp.stack([jnp.roll(y[:, 0], 1), jnp.roll(y[:, 1], 3)], axis=1)
     delayed, _ = replay(estimating(IDLE, late=(1, 3)))(shifted)
     # At sample k the late loop knows channel 0 up to k - 1 and channel 1 up to k - 3: filter that log directly.
@@ -110,11 +108,9 @@ def test_filters_use_the_times_of_samples_and_of_controls():
     for late in (0, 2):
         y = x[:, :2].copy()
         y[late:, 1] = y[: len(y) - late, 1]
-        settings = {"delay": delay, "late": (0, late)}
-        timed, untimed = (replay(estimating(law, sharp, start, **settings, **more)) for more in ({"rate": 100.0}, {}))
-        known, ignored = (np.abs(one(y, t)[0] - x)[:, 2:].max(axis=0) for one in (timed, untimed))
+        estimates = replay(estimating(law, sharp, start, delay=delay, late=(0, late)))
+        known, ignored = (np.abs(estimates(y, times)[0] - x)[:, 2:].max(axis=0) for times in (t, None))
         assert (known < 0.25 * ignored).all()
-        assert_allclose(timed(y)[0], untimed(y)[0], rtol=0, atol=1e-9)
 
 
 def test_wrong_numbers_of_samples_are_refused():
@@ -129,8 +125,8 @@ def test_wrong_numbers_of_samples_are_refused():
 
 @pytest.mark.slow
 def test_a_controller_with_an_unscented_filter_and_late_measurements_is_the_same_in_c(tmp_path):
-    settings = {"controls": 1, "measurements": 2, "delay": 1, "late": (0, 1), "every": (1, 2), "rate": 100.0}
-    controller = with_estimate(ASKED, unscented(PROCESS), PRIOR, **settings)
+    settings = {"controls": 1, "delay": 1, "late": (0, 1), "every": (1, 2), "rate": 100.0}
+    controller = with_estimate(ASKED, PROCESS._replace(unscented=True), PRIOR, **settings)
     leaves, tree = jax.tree.flatten(controller.start)
 
     def act(t, y, *memory):

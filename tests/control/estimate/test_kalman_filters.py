@@ -8,11 +8,16 @@ from calls import one_line
 from scipy.stats import chi2
 
 import dln_jax
-from dln_jax.control.estimate.extended import extended
-from dln_jax.control.estimate.loop import filtered
-from dln_jax.control.estimate.process import Process, belief, mechanical
-from dln_jax.control.estimate.tuning import consistency, from_log, tuned
-from dln_jax.control.estimate.unscented import unscented
+from dln_jax.control.estimate.kalman import (
+    Process,
+    belief,
+    consistency,
+    filtered,
+    mechanical,
+    predict,
+    update,
+)
+from dln_jax.control.estimate.tuning import from_log, tuned
 from dln_jax.data.schema import Trajectories
 from dln_jax.scenes.pendulums import cart_pole, pendulum
 
@@ -41,7 +46,7 @@ def linear_log(samples, seed=0):
 
 def textbook(y, u, seen):
     """Means of the Kalman filter in its plain form."""
-    x, P = np.asarray(PRIOR.x), np.asarray(PRIOR.covariance)
+    x, P = np.asarray(PRIOR.x), np.asarray(PRIOR.W @ PRIOR.W.T)
     Q = G * LINEAR.disturbance**2 @ G.T
     R = np.diag(LINEAR.noise**2)
     means = []
@@ -60,19 +65,19 @@ def test_filters_of_a_linear_process_are_the_kalman_filter_at_several_rates():
     y, u = linear_log(40)
     seen = np.stack([np.arange(40) % 2 == 0, np.arange(40) % 5 == 0], axis=1)
     expected = textbook(y, u, seen)
-    for make in (extended, unscented):
-        means = jax.jit(lambda y, make=make: filtered(make(LINEAR), PRIOR, y, u, seen)[0])
+    for process in (LINEAR, LINEAR._replace(unscented=True)):
+        means = jax.jit(lambda y, process=process: filtered(process, PRIOR, y, u, seen)[0])
         np.testing.assert_allclose(means(y), expected, rtol=0, atol=1e-12)
         # A channel that is not seen may hold anything.
         np.testing.assert_array_equal(means(np.where(seen, y, np.nan)), means(y))
 
 
 def test_the_covariance_stays_positive_with_encoders_a_million_times_better_than_the_prior():
-    sharp = extended(LINEAR._replace(noise=np.array([1e-9, 1e-9])))
-    memory = belief(np.zeros(3), 1e4)
+    sharp = LINEAR._replace(noise=np.array([1e-9, 1e-9]))
+    now = belief(np.zeros(3), 1e4)
     for _ in range(5):
-        memory = sharp.predict(sharp.update(memory, jnp.zeros(2), jnp.ones(2, bool))[0], jnp.zeros(1))
-        assert np.linalg.eigvalsh(memory.covariance).min() > -1e-16
+        now = predict(sharp, update(sharp, now, jnp.zeros(2))[0], jnp.zeros(1))
+        assert np.linalg.eigvalsh(now.W @ now.W.T).min() > -1e-16
 
 
 def test_errors_on_a_cart_pole_are_as_large_as_the_covariance_says():
@@ -93,14 +98,13 @@ def test_errors_on_a_cart_pole_are_as_large_as_the_covariance_says():
         return x, x[:, :2] + v, u
 
     logs = jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(0), 60))
-    for make in (extended, unscented):
-        kalman = make(process)
+    for kind in (process, process._replace(unscented=True)):
 
-        def sample(memory, row, kalman=kalman):
+        def sample(now, row, kind=kind):
             x, y, u = row
-            memory, innovation = kalman.update(memory, y, jnp.ones(2, bool))
-            off = jnp.linalg.solve(memory.W, x - memory.x)
-            return kalman.predict(memory, u), (off @ off, consistency(innovation))
+            now, innovation = update(kind, now, y)
+            off = jnp.linalg.solve(now.W, x - now.x)
+            return predict(kind, now, u), (off @ off, consistency(innovation))
 
         squared, ratio = jax.jit(jax.vmap(lambda *log, sample=sample: jax.lax.scan(sample, prior, log)[1]))(*logs)
         # Runs are independent, samples of one are not: a time's sum over runs has 4 x 60 degrees of freedom.
@@ -129,25 +133,22 @@ def test_late_samples_do_not_look_like_noise_if_the_log_has_their_times():
     absent = np.full((400, 1), np.nan)
     even = np.arange(400) / 200.0
     log = Trajectories(even + late, np.stack(q), absent, absent, tau, np.zeros(400, int), np.array(["a"]))
-    of_times, of_even_times = (from_log(model, one).process for one in (log, log._replace(t=even)))
+    of_times, of_even_times = (from_log(model, one) for one in (log, log._replace(t=even)))
     assert resolution / np.sqrt(12) * 0.999 < of_times.noise[0] < 5e-4 and of_even_times.noise[0] > 2e-3
     assert 0.03 < of_times.disturbance[0] < 0.3
 
 
 @pytest.mark.slow
-def test_noise_and_disturbance_are_found_from_logs_of_several_lengths():
-    wrong = LINEAR._replace(disturbance=np.array([0.2, 0.1]), noise=np.array([0.3, 1.0]))
+def test_disturbance_is_found_from_logs_of_several_lengths():
+    wrong = LINEAR._replace(disturbance=np.array([0.2, 0.1]))
     logs = [(PRIOR, *linear_log(samples, seed)) for seed, samples in enumerate((400, 100))]
-    found = tuned(wrong, logs, noise=True).process
-    np.testing.assert_allclose(found.noise, LINEAR.noise, rtol=0.1)
-    np.testing.assert_allclose(found.disturbance, LINEAR.disturbance, rtol=0.25)
+    np.testing.assert_allclose(tuned(wrong, logs).disturbance, LINEAR.disturbance, rtol=0.25)
 
 
 def test_curvature_of_a_measurement_counts_as_noise():
     """Of y = a² with a ~ N(0, s²) and an unseen b, the points ±√2 s and 0 have the mean s² and the variance s⁴."""
-    process = Process(lambda x, u, w: x, lambda x: x[:1] ** 2, disturbance=np.zeros(0), noise=0.1)
-    start = unscented(process).start(belief(jnp.zeros(2), jnp.array([0.5, 1.0])))
-    _, innovation = unscented(process).update(start, jnp.array([0.25]), jnp.array([True]))
+    process = Process(lambda x, u, w: x, lambda x: x[:1] ** 2, np.zeros(0), 0.1, unscented=True)
+    _, innovation = update(process, belief(jnp.zeros(2), jnp.array([0.5, 1.0])), jnp.array([0.25]))
     assert innovation.residual == pytest.approx(0.0) and innovation.variance == pytest.approx(0.1**2 + 0.5**4)
 
 

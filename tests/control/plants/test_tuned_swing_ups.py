@@ -9,11 +9,10 @@ from numpy.testing import assert_allclose
 
 from dln_jax.control.closed_loop import Hardware, simulate, stateless
 from dln_jax.control.plants.exploring import NEAR, Exploration, explore
-from dln_jax.control.plants.plant import layout
+from dln_jax.control.plants.plant import layout, plant_of
 from dln_jax.control.plants.recovery import recovering
 from dln_jax.control.plants.runs import compiled, distances, judged_runs, run, start_of
 from dln_jax.control.plants.scales import USUAL, circle, scales_of, swing_up_numbers
-from dln_jax.control.plants.simulated import plant_of
 from dln_jax.control.plants.tuning import trial_of, tune
 from dln_jax.control.state_space import field_of
 from dln_jax.control.swing_up import upright_of
