@@ -50,15 +50,6 @@ class Source:
     loop_bound: int | None = None
     """A loop without a known bound ends with NaN after this number of iterations."""
     tables: dict[tuple[str, bytes], tuple[str, np.ndarray]] = field(default_factory=dict)
-    functions: set[str] = field(default_factory=set)
-    """Elementary functions called on scalars."""
-    arrays: set[str] = field(default_factory=set)
-    """Elementary functions called on arrays."""
-    integers: set[str] = field(default_factory=set)
-    """Integer functions called."""
-    kernels: set[str] = field(default_factory=set)
-    orders: set[tuple[str, ...]] = field(default_factory=set)
-    """Kinds of the keys of every sort."""
     parts: dict[bytes, "Called"] = field(default_factory=dict)
     """Functions that others call, by the key of their program."""
     names: dict[str, str] = field(default_factory=dict)

@@ -7,10 +7,9 @@ from itertools import pairwise
 import numpy as np
 
 from dln_jax.export.c.body import Body
-from dln_jax.export.c.nodes import Node, is_constant, owners, read_source, strides, values
-from dln_jax.export.c.operations import BY_BITS, OPERATIONS, VECTORISED, expression
-from dln_jax.export.c.simplify import UNROLL_LIMIT
-from dln_jax.export.c.text import C_TYPES, NUMPY_TYPES
+from dln_jax.export.c.nodes import UNROLL_LIMIT, Node, owners, read_source, strides
+from dln_jax.export.c.operations import OPERATIONS, VECTORISED, expression
+from dln_jax.export.c.text import C_TYPES
 
 _CHOICES = {
     "select": "elementary_choice({0}, {1}, {2})",
@@ -27,7 +26,6 @@ def unrolled(body: Body, node: Node) -> set[Node]:
     """Writes a scalar as an expression of variables and of the scalars fused into it; returns the nodes written."""
     if node in body.plan.beside and not body.source.libm:
         pair = sorted((node, body.plan.beside[node]), key=lambda scalar: scalar.op, reverse=True)
-        body.source.functions.add("sin_cos")
         body.spend(sin=1)
         for scalar in pair:
             body.declared(body.name(scalar), "real", 0)
@@ -60,32 +58,11 @@ def _expression(body: Body, node: Node, args: list[str], *, looped: bool = False
     if node.dtype == "real" or node.args[0].dtype == "real":
         body.spend(**{node.op: 1})
     if operation.function in VECTORISED and not body.source.libm:
-        body.source.functions.add(node.op)
         return f"elementary_{node.op}({args[0]})"
     if looped and node.dtype == "real" and node.op in _CHOICES:
-        body.source.functions.add("choice")
         return _CHOICES[node.op].format(*args)
-    if (function := BY_BITS.get(node.op)) is not None:
-        body.source.functions.add(function)
-    if name := _guarded(node):
-        body.source.integers.add(name)
-        return f"elementary_{name}({', '.join(args)})"
     # The kind of the operands decides; the result of a comparison is bool.
     return expression(node.op, node.args[-1].dtype, *args, suffix=body.source.suffix)
-
-
-def _guarded(node: Node) -> str | None:
-    """Returns the name of the integer function that keeps an operation from trapping, or None if none is needed."""
-    if node.op.startswith("shift_"):
-        return f"{node.op}_{node.dtype}"
-    if node.op in ("integer_div", "integer_rem"):
-        divisor = node.args[1]
-        if is_constant(divisor) and not np.isin(values(divisor), (0, ~NUMPY_TYPES[node.dtype](0))).any():
-            return None
-        return f"{'quotient' if node.op == 'integer_div' else 'remainder'}_{node.dtype}"
-    if node.op.startswith("to_") and node.args[0].dtype == "real" and node.dtype != "bool":
-        return f"{node.dtype}_of"
-    return None
 
 
 def looped(body: Body, node: Node) -> None:
@@ -102,7 +79,6 @@ def looped(body: Body, node: Node) -> None:
     target = body.kept(node)
     if node.op in VECTORISED and not body.source.libm:
         body.spend(**{node.op: node.size})
-        body.source.arrays.add(node.op)
         body.line(f"elementary_{node.op}_each({node.size}, {body.name(node.args[0])}, {target});")
         return
     shape = _merged(node.shape, [_steps(body, arg, positions) for arg, positions in where.items()])

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 from jax.extend import core
 
-from dln_jax.export.c.nodes import Node, is_constant, values
+from dln_jax.export.c.nodes import VECTOR, Node, is_constant, values
 from dln_jax.export.c.primitives import Rule, convert, rows_of
 from dln_jax.export.c.program import Program
-from dln_jax.export.c.simplify import VECTOR
 from dln_jax.export.c.text import UNSIGNED, limit
 
 _COMBINED = ("add", "sub", "mul", "min", "max")

@@ -1,6 +1,7 @@
 """C of reductions, scattered updates and sorts; functions on matrices are in `factorisations`."""
 
-from collections.abc import Collection, Sequence
+import re
+from collections.abc import Collection
 from string import Template
 
 import numpy as np
@@ -13,6 +14,7 @@ from dln_jax.export.c.operations import OPERATIONS
 from dln_jax.export.c.products import summed
 from dln_jax.export.c.text import C_TYPES
 
+_PREFIX = "order_"
 _ORDER = Template("""
 /* Places of each row's elements [rows, n] in ascending order of their keys, by merging; NaN last */
 static inline int ${name}_before(long long i, long long j$keys)
@@ -41,14 +43,11 @@ static void $name(int rows, int n, long long *merged, long long *order$keys)
 """)
 
 
-def _name(kinds: Sequence[str]) -> str:
-    return "_".join(("elementary_order", *kinds))
-
-
-def orderings(orders: Collection[tuple[str, ...]]) -> str:
-    """Returns the C functions that sort by keys of these kinds, the first key taking precedence."""
+def orderings(names: Collection[str]) -> str:
+    """Returns the C functions with these names, which sort by keys of the kinds in it, the first taking precedence."""
     text = ""
-    for kinds in sorted(orders):
+    for name in sorted(name for name in names if name.startswith(_PREFIX)):
+        kinds = re.findall("|".join(sorted(C_TYPES, key=len, reverse=True)), name.removeprefix(_PREFIX))
         comparisons = ""
         for place, kind in enumerate(kinds):
             for first, second, before in (("i", "j", 1), ("j", "i", 0)):
@@ -57,7 +56,7 @@ def orderings(orders: Collection[tuple[str, ...]]) -> str:
                 comparisons += f"    if ({a} < {b}{nan_last}) return {before};\n"
         keys = "".join(f", const {C_TYPES[kind]} *key{place}" for place, kind in enumerate(kinds))
         passed = "".join(f", key{place}" for place in range(len(kinds)))
-        text += _ORDER.substitute(name=_name(kinds), keys=keys, passed=passed, comparisons=comparisons)
+        text += _ORDER.substitute(name=f"elementary_{name}", keys=keys, passed=passed, comparisons=comparisons)
     return text
 
 
@@ -124,11 +123,10 @@ def _put(body: Body, node: Node) -> None:
 def _order(body: Body, node: Node) -> None:
     """Writes a call of the function that sorts by the keys of a node."""
     rows, n = node.shape
-    kinds, merged = tuple(key.dtype for key in node.args), f"v{node.number}_merged"
-    body.source.orders.add(kinds)
+    name, merged = _PREFIX + "_".join(key.dtype for key in node.args), f"v{node.number}_merged"
     body.declared(merged, "index", n)
     target = body.kept(node)
-    body.line(f"{_name(kinds)}({rows}, {n}, {merged}, {target}, {', '.join(map(body.pointer, node.args))});")
+    body.line(f"elementary_{name}({rows}, {n}, {merged}, {target}, {', '.join(map(body.pointer, node.args))});")
 
 
 WRITERS = {

@@ -8,18 +8,17 @@ from typing import Any
 import numpy as np
 from jax.dtypes import float0
 
-from dln_jax.export.c import control_flow, indexing, linear_algebra, primitives
+from dln_jax.export.c import control_flow, indexing, primitives
 from dln_jax.export.c.jaxprs import closed_jaxpr, expanded, implementation, is_error_of_equinox, made_at
 from dln_jax.export.c.nodes import Node, is_constant, values
-from dln_jax.export.c.program import Part, Program
+from dln_jax.export.c.operations import OPERATIONS
+from dln_jax.export.c.program import Program
 from dln_jax.export.c.text import PRECISIONS, failure, kind_of
 from dln_jax.types import InputError
 
 _CALLS = {
-    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "remat": "jaxpr",
-    "checkpoint": "jaxpr", "eval_jaxpr": "call_jaxpr", "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr", "remat2": "jaxpr", "custom_vjp_call_jaxpr": "fun_jaxpr",
-    "custom_vmap_call": "call",
+    "jit": "jaxpr", "closed_call": "call_jaxpr", "remat2": "jaxpr", "eval_jaxpr": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "custom_vmap_call": "call",
 }  # fmt: skip
 _WITHOUT_EFFECT = frozenset((
     "accuracy", "algorithm", "use_magma", "sharding", "out_sharding", "unroll", "linear",
@@ -103,7 +102,7 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
     results = [variable.aval for variable in equation.outvars]
     if is_error_of_equinox(equation):
         return [_failed(program, aval) for aval in results]
-    if name in _RULES:
+    if name in _RULES or name in OPERATIONS:
         return _ruled(program, equation, args)
     if why := next((reason for part, reason in _REFUSED.items() if part in name), None):
         raise InputError(f"'{name}' is {why}")
@@ -116,14 +115,15 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
 def _ruled(program: Program, equation: Any, args: list[Node]) -> list[Node]:
     """Returns the results by the primitive's rule; refuses parameters that the rule does not read."""
     name, results = equation.primitive.name, [variable.aval for variable in equation.outvars]
-    read = inspect.signature(_RULES[name]).parameters
+    rule = _RULES.get(name) or (lambda program, *args: program.elementwise(name, *args))
+    read = inspect.signature(rule).parameters
     for key, value in equation.params.items():
         if key not in read and key not in _WITHOUT_EFFECT and value is not None and value is not False:
             raise InputError(f"the primitive '{name}' has no C with {key}={value}".partition("\n")[0])
     if results and all(0 in aval.shape for aval in results):
         return [program.constant(np.zeros(aval.shape), kind_of(aval.dtype)) for aval in results]
     known = {**equation.params, "results": results, "kind": kind_of(results[0].dtype) if results else None}
-    nodes = _RULES[name](program, *args, **{key: known[key] for key in read if key in known})
+    nodes = rule(program, *args, **{key: known[key] for key in read if key in known})
     return list(nodes) if isinstance(nodes, list | tuple) else [nodes]
 
 
@@ -145,8 +145,8 @@ def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
             else part.make("input", arg.shape, arg.dtype, attribute=k - sum(place < k for place in fixed))
             for k, arg in enumerate(args)
         ]
-        program.parts[call] = Part(part, _inline(part, closed, inside))
-    shapes = [(result.shape, result.dtype) for result in program.parts[call].results]
+        program.parts[call] = part, _inline(part, closed, inside)
+    shapes = [(result.shape, result.dtype) for result in program.parts[call][1]]
     passed = [arg for k, arg in enumerate(args) if k not in fixed]
     return control_flow.projections(program, program.make("call", (), "int", passed, attribute=call), shapes)
 
@@ -167,7 +167,6 @@ def _platform(program: Program, *, platforms) -> Node:
 _RULES = {
     **primitives.RULES,
     **indexing.RULES,
-    **linear_algebra.RULES,
     **control_flow.RULES,
     "platform_index": _platform,
     "custom_linear_solve": _custom_linear_solve,

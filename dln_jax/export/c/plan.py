@@ -9,10 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dln_jax.export.c.nodes import Loop, Node, Region, is_direct
+from dln_jax.export.c.nodes import UNROLL_LIMIT, Loop, Node, Region, is_direct
 from dln_jax.export.c.operations import OPERATIONS, VECTORISED
 from dln_jax.export.c.program import Program
-from dln_jax.export.c.simplify import UNROLL_LIMIT
 
 _DEPTH = 16
 """Largest depth of a scalar expression; compilers limit the nesting of parentheses."""
@@ -150,7 +149,7 @@ def _fused(nodes: list[Node], readers: dict[Node, list[Node]], whole, unrolled, 
 def _is_read_again(node: Node, readers: list[Node]) -> bool:
     """Returns whether a scalar occurs more than once in the C of its readers."""
     if len(readers) > 1 or readers[0].op != "gather":
-        return len(readers) > 1 or OPERATIONS[readers[0].op].repeats_arguments
+        return len(readers) > 1 or OPERATIONS[readers[0].op].repeats_arguments(node.dtype)
     start = sum(arg.size for arg in readers[0].args[: readers[0].args.index(node)])
     return bool((np.asarray(readers[0].value) == start).sum() > 1)
 

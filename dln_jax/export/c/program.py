@@ -20,28 +20,34 @@ gathers and selections at constant indices) is a `gather`: it names the source o
 | `call` | a call of another program |
 | `while`, `repeat`, `branch` | control flow; `project` takes a result, an iteration reads `carry` and `counter` |
 
-`simplify` decides which operations are replaced by simpler ones and which are written as scalars.
+Simplifications keep the results of IEEE arithmetic, except the sign of zero in 0 + x = x, which XLA simplifies too.
+1 x = x always holds, but 0 x = 0, 0 / x = 0 and 0 - x = -x hold only for finite numbers: they are applied in programs
+that assume finite arguments (`Program.finite`), so that structural zeros of a derivative cost nothing.
 """
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from math import prod
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from dln_jax.export.c import simplify
-from dln_jax.export.c.nodes import Loop, Node, Region, is_constant, owners, values, without_unused
-from dln_jax.export.c.operations import COMMUTATIVE, OPERATIONS, on_kind
-from dln_jax.export.c.text import LARGEST, NUMPY_TYPES
+from dln_jax.export.c.nodes import (
+    Loop,
+    Node,
+    Region,
+    is_all,
+    is_constant,
+    is_uniform,
+    owners,
+    unrolls,
+    unrolls_product,
+    values,
+    without_unused,
+)
+from dln_jax.export.c.operations import COMMUTATIVE, OPERATIONS, neutral, on_kind
+from dln_jax.export.c.text import LARGEST, NUMPY_TYPES, UNSIGNED
 from dln_jax.types import InputError
-
-
-class Part(NamedTuple):
-    """A program that others call."""
-
-    program: "Program"
-    results: list[Node]
 
 
 @dataclass
@@ -56,8 +62,8 @@ class Program:
     """NumPy type of real numbers; constants are folded in it."""
     repeated: Collection[int] = ()
     """`id` values of jaxprs whose calls stay calls."""
-    parts: dict[Any, Part] = field(default_factory=dict)
-    """Called programs by the `id` of the jaxpr and the constant arguments, which are the attribute of a `call`."""
+    parts: dict[Any, tuple["Program", list[Node]]] = field(default_factory=dict)
+    """Called programs with their results, by the attribute of a `call`: `id` of the jaxpr, and constant arguments."""
     inline: Any = None
     """(program, closed jaxpr, arguments) -> results."""
     finite: bool = False
@@ -145,16 +151,70 @@ class Program:
             with np.errstate(all="ignore"):
                 value = operation.fold(*map(values, args))
             return self.constant(np.broadcast_to(value, shape), dtype)
-        for other in (simplify.simpler, simplify.below_broadcast):
-            if (equal := other(self, op, args, shape)) is not None:
+        for other in (self._simpler, self._below_broadcast):
+            if (equal := other(op, args, shape)) is not None:
                 return equal
-        if simplify.unrolls(self, op, args, shape):
+        if unrolls(op, args, shape, finite=self.finite):
             columns = [self.scalars(arg) * (prod(shape) if arg.shape == () else 1) for arg in args]
             elements = [self.elementwise(op, *row) for row in zip(*columns, strict=True)]
             return self.gather(elements, np.arange(len(elements)).reshape(shape))
         if op in COMMUTATIVE:
             args = tuple(sorted(args, key=lambda arg: arg.number))
         return self.make(op, shape, dtype, args)
+
+    def _simpler(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
+        """Returns an equal node that takes less work than the operation, or None."""
+        a, b = args[0], args[-1]
+        for kept, other in ((a, b), (b, a))[: 2 if op in (*COMMUTATIVE, "max", "min") else 1]:
+            if (number := neutral(op, a.dtype)) is not None and is_all(other, number):
+                return self.broadcast(kept, shape)
+        if op in ("add", "sub") and b.op == "neg":
+            return self.elementwise("sub" if op == "add" else "add", a, b.args[0])
+        if op == "add" and a.op == "neg":
+            return self.elementwise("sub", b, a.args[0])
+        if op == "neg" and a.op == "neg":
+            return a.args[0]
+        if op == "abs" and a.op in ("neg", "abs"):
+            return self.elementwise("abs", a.args[0])
+        if (op in ("max", "min") and a is b) or (op == "select" and args[1] is b):
+            return self.broadcast(b, shape)
+        if op == "multiply_add":
+            factors = args[:2]
+            trivial = is_all(b, 0) or any(is_all(factor, 1) for factor in factors)
+            if trivial or (self.finite and any(is_all(factor, 0) for factor in factors)):
+                return self.elementwise("add", self.elementwise("mul", *factors), b)
+            return None
+        unsigned, real = a.dtype in UNSIGNED, a.dtype == "real"
+        alike = a is b and (op in ("lt", "gt") or (not real and op in ("eq", "ne", "le", "ge")))
+        beside_zero = (op in ("lt", "ge") and is_all(b, 0)) or (op in ("gt", "le") and is_all(a, 0))
+        if alike or (unsigned and beside_zero):  # compilers warn about comparisons with a known result
+            return self.broadcast(self.constant(op in ("eq", "le", "ge"), "bool"), shape)
+        if real and not self.finite:
+            return None
+        if op == "sub" and is_all(a, 0):
+            return self.elementwise("neg", self.broadcast(b, shape))
+        absorbs = op == "mul" or (op == "min" and unsigned)
+        if (absorbs and is_all(b, 0)) or ((absorbs or (op == "div" and real)) and is_all(a, 0)):
+            return self.broadcast(self.constant(0, a.dtype), shape)
+        return None
+
+    def _below_broadcast(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
+        """Returns the operation applied before a common broadcast of its arguments, or None if they share none."""
+        repeated = [arg for arg in args if arg.size > 1 and not is_uniform(arg)]
+        others = [arg for arg in args if arg.size == 1 or is_uniform(arg)]
+        if not shape or any(arg.op == "const" for arg in repeated) or len(repeated) + len(others) < len(args):
+            return None
+        if not repeated:
+            if prod(shape) <= 1:
+                return None
+            return self.broadcast(self.elementwise(op, *map(self.one, args)), shape)
+        positions, source = np.asarray(repeated[0].value), repeated[0].args[:1]
+        for arg in repeated:
+            alike = arg.op == "gather" and len(arg.args) == 1 and arg.args[0].shape == source[0].shape
+            if not alike or arg.args[0].size >= arg.size or not np.array_equal(np.asarray(arg.value), positions):
+                return None
+        below = [arg.args[0] if any(arg is one for one in repeated) else self.one(arg) for arg in args]
+        return self.gather([self.elementwise(op, *below)], positions)
 
     def dot_general(self, a: Node, b: Node) -> Node:
         """Returns sum_k a[b, m, k] b[b, k, n]; products with a constant are transposed so that it comes second."""
@@ -167,7 +227,7 @@ class Program:
             return self.elementwise("mul", self.broadcast(a, (batch, m, n)), self.broadcast(b, (batch, m, n)))
         if is_constant(a) and not is_constant(b):
             return self.transpose(self.dot_general(self.transpose(b), self.transpose(a)))
-        if not simplify.unrolls_product(self, a, b):
+        if not unrolls_product(a, b, finite=self.finite):
             return self.make("dot_general", (batch, m, n), a.dtype, (a, b))
         left, right = (np.array(self.scalars(node), object).reshape(node.shape) for node in (a, b))
         elements = [self._dot(left[batch, i], right[batch, :, j]) for batch, i, j in np.ndindex(batch, m, n)]
