@@ -12,6 +12,8 @@ from itertools import accumulate
 from math import prod
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
@@ -90,37 +92,30 @@ def _power(program: Program, x: Node, exponent: Node, *, kind: str) -> Node:
     return program.elementwise("pow", *(convert(program, node, kind) for node in (x, exponent)))
 
 
-def _integer_power(program: Program, x: Node, *, y: int) -> Node:
-    result, power, left = None, x, abs(y)
+def _composed(function: Callable[..., Any]) -> Rule:
+    """Returns the rule of a primitive that a JAX function of the same arguments composes of others."""
+
+    @functools.wraps(function)
+    def rule(program: Program, *nodes: Node, **parameters: Any) -> list[Node]:
+        types = [program.real if node.dtype == "real" else NUMPY_TYPES[node.dtype] for node in nodes]
+        examples = [jax.ShapeDtypeStruct(node.shape, dtype) for node, dtype in zip(nodes, types, strict=True)]
+        return program.inline(program, jax.make_jaxpr(functools.partial(function, **parameters))(*examples), nodes)
+
+    return rule
+
+
+def _integer_power(x, *, y):
+    result, power, left = jnp.ones_like(x), x, abs(y)
     while left:
-        if left & 1:
-            result = power if result is None else program.elementwise("mul", result, power)
+        result = result * power if left & 1 else result
         left >>= 1
-        power = program.elementwise("mul", power, power) if left else power
-    one = program.constant(1, x.dtype)
-    if result is None:
-        return program.broadcast(one, x.shape)
-    return result if y > 0 else program.elementwise("div", one, result)
+        power = power * power if left else power
+    return result if y >= 0 else 1 / result
 
 
-def _sign(program: Program, x: Node) -> Node:
-    minus, one = (program.constant(number, x.dtype) for number in (-1, 1))
-    positive, negative = (program.elementwise(name, x, 0) for name in ("gt", "lt"))
-    # 0 and NaN are returned as they are.
-    return program.select(positive, program.select(negative, x, minus), one)
-
-
-def _logistic(program: Program, x: Node) -> Node:
-    decay = program.elementwise("exp", program.elementwise("neg", x))
-    return program.elementwise("div", 1, program.elementwise("add", 1, decay))
-
-
-def _one_minus_square(program: Program, x: Node) -> Node:
-    return program.elementwise("mul", program.elementwise("sub", 1, x), program.elementwise("add", 1, x))
-
-
-def _clamp(program: Program, low: Node, x: Node, high: Node) -> Node:
-    return program.elementwise("min", program.elementwise("max", x, low), high)
+def _sign(x):
+    one = jnp.ones_like(x)
+    return jnp.where(x > 0, one, jnp.where(x < 0, -one, x))  # 0 and NaN are returned as they are
 
 
 def _select_n(program: Program, which: Node, *cases: Node) -> Node:
@@ -261,27 +256,27 @@ def _householder_product(program: Program, a: Node, tau: Node) -> list[Node]:
     return _applied(program, "householder_product", a, tau, shapes=[a.shape[-2:]], ranks=(2, 1))
 
 
-def _ormqr(program: Program, a: Node, tau: Node, c: Node, *, left: bool, transpose: bool) -> Node:
+def _with_columns(a, count):
+    """Returns matrices with columns of zeros appended up to a count."""
+    return jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, max(count - a.shape[-1], 0))])
+
+
+def _ormqr(a, tau, c, *, left, transpose):
     """Multiplies by the whole orthogonal matrix of reflectors."""
-    *batch, m, n = a.shape
-    index = np.arange(a.size).reshape(a.shape)
-    square = np.pad(index, [(0, 0)] * (len(batch) + 1) + [(0, m - n)], constant_values=a.size)
-    (q,) = _householder_product(program, program.gather([a, program.constant(0.0, "real")], square), tau)
-    q, c = (program.reshape(node, (prod(batch), *node.shape[-2:])) for node in (q, c))
-    q = program.transpose(q) if transpose else q
-    return program.reshape(program.dot_general(*((q, c) if left else (c, q))), (*batch, *c.shape[-2:]))
+    q = lax.linalg.householder_product(_with_columns(a, a.shape[-2]), tau)
+    q = q.mT if transpose else q
+    return q @ c if left else c @ q
+
+
+def _q_and_r(packed, tau, *, full_matrices):
+    m, n = packed.shape[-2:]
+    rows = m if full_matrices else min(m, n)
+    q = lax.linalg.householder_product(_with_columns(packed, rows)[..., :rows], tau)
+    return q, jnp.triu(packed[..., :rows, :])
 
 
 def _qr(program: Program, a: Node, *, full_matrices: bool) -> list[Node]:
-    """Applies `qr` by the two rules above, as JAX does."""
-    (*batch, m, n), full = a.shape, full_matrices
-    packed, tau = _geqrf(program, a)
-    zero, rows, columns = program.constant(0.0, "real"), m if full else min(m, n), m if full or m < n else n
-    index = np.arange(a.size).reshape(a.shape)
-    wide = np.pad(index, [(0, 0)] * (len(batch) + 1) + [(0, max(columns - n, 0))], constant_values=a.size)
-    (q,) = _householder_product(program, program.gather([packed, zero], wide[..., :columns]), tau)
-    upper = np.where(np.arange(rows)[:, None] <= np.arange(n), index[..., :rows, :], a.size)
-    return [q, program.gather([packed, zero], upper)]
+    return _composed(_q_and_r)(program, *_geqrf(program, a), full_matrices=full_matrices)
 
 
 def _eigh(program: Program, a: Node, *, lower: bool, subset_by_index) -> list[Node]:
@@ -298,15 +293,15 @@ _OF_REDUCTIONS = {"sum": "add", "prod": "mul", "max": "max", "min": "min", "and"
 RULES: dict[str, Rule] = {
     **dict.fromkeys(("stop_gradient", "copy", "device_put", "optimization_barrier"), lambda _, *nodes: nodes),
     "add_any": lambda program, a, b: program.elementwise("add", a, b),
-    "square": lambda program, x: program.elementwise("mul", x, x),
+    "square": _composed(lambda x: x * x),
     "reduce_precision": _reduce_precision,
-    "sign": _sign,
-    "rsqrt": lambda program, x: program.elementwise("div", 1, program.elementwise("sqrt", x)),
+    "sign": _composed(_sign),
+    "rsqrt": _composed(lambda x: 1 / jnp.sqrt(x)),
     "pow": _power,
-    "integer_pow": _integer_power,
-    "logistic": _logistic,
-    "one_minus_square": _one_minus_square,
-    "clamp": _clamp,
+    "integer_pow": _composed(_integer_power),
+    "logistic": _composed(lambda x: 1 / (1 + jnp.exp(-x))),
+    "one_minus_square": _composed(lambda x: (1 - x) * (1 + x)),
+    "clamp": _composed(lambda low, x, high: jnp.minimum(jnp.maximum(x, low), high)),
     "round": lambda program, x, *, rounding_method: program.elementwise("rint" if int(rounding_method) else "round", x),
     "select_n": _select_n,
     "convert_element_type": lambda program, x, *, kind: convert(program, x, kind),
@@ -332,7 +327,7 @@ RULES: dict[str, Rule] = {
     **{f"cum{name}": _cumulative(_OF_REDUCTIONS[name]) for name in ("sum", "prod", "max", "min")},
     "geqrf": _geqrf,
     "householder_product": _householder_product,
-    "ormqr": _ormqr,
+    "ormqr": _composed(_ormqr),
     "qr": _qr,
     "eigh": _eigh,
     "cholesky": lambda program, a: _applied(program, "cholesky", a, shapes=[a.shape[-2:]]),
