@@ -28,14 +28,11 @@ def _gather(
         batched=(numbers.operand_batching_dims, numbers.start_indices_batching_dims),
         order=np.argsort([*outer, *numbers.offset_dims]),
     )  # fmt: skip
-    taken = take(program, operand, positions)
-    if inside is None:
-        return taken
     if fill_value is None:  # JAX's default
         fill_value = (
             np.nan if operand.dtype == "real" else limit(operand.dtype, upper=operand.dtype in ("bool", *UNSIGNED))
         )
-    return program.select(inside, program.constant(fill_value, operand.dtype), taken)
+    return program.select(inside, program.constant(fill_value, operand.dtype), take(program, operand, positions))
 
 
 def _scatter(op: str) -> Rule:
@@ -52,10 +49,8 @@ def _scatter(op: str) -> Rule:
         targets, inside = _windows(
             program, indices, operand.shape, sizes, mode, numbers.scatter_dims_to_operand_dims,
             dropped=dropped, batched=(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims),
-            order=np.arange(len(updates.shape)),
         )  # fmt: skip
-        if inside is not None:
-            targets = program.select(inside, program.constant(-1, "index"), targets)
+        targets = program.select(inside, program.constant(-1, "index"), targets)
         outer = [axis for axis in range(len(updates.shape)) if axis not in numbers.update_window_dims]
         order = np.arange(updates.size).reshape(updates.shape).transpose([*outer, *numbers.update_window_dims])
         updates = program.gather([updates], order)
@@ -67,60 +62,48 @@ def _scatter(op: str) -> Rule:
 
 
 def _windows(
-    program: Program, indices: Node, shape, sizes, mode: Any, axes, *, dropped, batched, order
-) -> tuple[Node, Node | None]:
-    """Returns the flat positions of windows and, if windows outside are dropped, which positions are inside.
+    program: Program, indices: Node, shape, sizes, mode: Any, axes, *, dropped=(), batched=((), ()), order=None
+) -> tuple[Node, Node]:
+    """Returns the flat positions of windows, clamped into the operand, and which to keep if those outside are dropped.
 
     Args:
         program: program in which they are computed.
         indices: corners of the windows [batch, axes].
+        shape: shape of the operand.
         sizes: size of a window along each axis of the operand.
         mode: mode of `lax.gather` or `lax.scatter`, for windows outside.
         axes: axes of the operand that the indices refer to.
         dropped: axes of the operand that a window lacks.
         batched: corresponding axes of the operand and of the indices.
-        order: order of the result's axes, among those of the batch followed by those of a window.
+        order: order of the result's axes, among those of the batch followed by those of a window, if it differs.
     """
-    batch, index = indices.shape[:-1], np.arange(indices.size).reshape(indices.shape)
-    flat = np.zeros(batch, np.int64)
+    batch, fills = indices.shape[:-1], "FILL" in str(mode).upper()
+    index, steps = np.arange(indices.size).reshape(indices.shape), [prod(shape[k + 1 :]) for k in range(len(shape))]
+    first = np.zeros(batch, np.int64)
     for axis, of_indices in zip(*batched, strict=True):
-        flat = flat + np.indices(batch)[of_indices] * _stride(shape, axis)
-    starts = {axis: program.gather([indices], index[..., component]) for component, axis in enumerate(axes)}
-    corners, inside = _corners(program, starts, shape, sizes, flat, fills="FILL" in str(mode).upper())
-    kept = [axis for axis in range(len(shape)) if axis not in dropped]
-    window = [sizes[axis] for axis in kept]
+        first = first + np.indices(batch)[of_indices] * steps[axis]
+    corners, inside = program.constant(first, "index"), program.constant(np.ones(batch), "bool")
+    for component, axis in enumerate(axes):
+        start, last = program.gather([indices], index[..., component]), shape[axis] - sizes[axis]
+        if start.dtype == "unsigned_long":  # an index may not hold it
+            start = program.elementwise("min", start, max(last + fills, 0))
+        start = convert(program, start, "index")
+        if fills:
+            for comparison, bound in (("ge", 0), ("le", last)):
+                inside = program.elementwise("and", inside, program.elementwise(comparison, start, bound))
+        clamped = program.elementwise("min", program.elementwise("max", start, 0), last)
+        corners = program.elementwise("add", corners, program.elementwise("mul", clamped, steps[axis]))
+    offsets = np.arange(prod(shape)).reshape(shape)[tuple(map(slice, sizes))].squeeze(tuple(dropped))
+    windows = np.arange(prod(batch)).reshape((*batch, *[1] * offsets.ndim))
 
     def placed(array: np.ndarray) -> np.ndarray:
-        return np.broadcast_to(array, (*batch, *window)).transpose(order)
+        whole = np.broadcast_to(array, (*batch, *offsets.shape))
+        return whole if order is None else whole.transpose(order)
 
-    windows = np.arange(prod(batch)).reshape((*batch, *[1] * len(window)))
     positions = program.elementwise(
-        "add",
-        program.gather([corners], placed(windows)),
-        program.constant(placed(_offsets(shape, kept, window)), "index"),
+        "add", program.gather([corners], placed(windows)), program.constant(placed(offsets), "index")
     )
-    return positions, None if inside is None else program.gather([inside], placed(windows))
-
-
-def _corners(program: Program, starts: dict[int, Node], shape, sizes, first, *, fills=False) -> tuple[Node, Any]:
-    """Returns the flat positions of windows' corners, clamped into the operand; with `fills`, also which were inside.
-
-    `starts` are the corner indices by axis of the operand; they are added to the flat positions `first`.
-    """
-    flat, inside = program.constant(first, "index"), None
-    for axis, start in starts.items():
-        last = shape[axis] - sizes[axis]
-        start = _index(program, start, last + fills)
-        if fills:
-            within = program.elementwise(
-                "and", program.elementwise("ge", start, 0), program.elementwise("le", start, last)
-            )
-            inside = within if inside is None else program.elementwise("and", inside, within)
-        clamped = program.elementwise("min", program.elementwise("max", start, 0), last)
-        flat = program.elementwise("add", flat, program.elementwise("mul", clamped, _stride(shape, axis)))
-    if inside is not None and is_constant(inside) and values(inside).all():
-        inside = None
-    return flat, inside
+    return positions, program.gather([inside], placed(windows))
 
 
 def take(program: Program, operand: Node, positions: Node) -> Node:
@@ -165,11 +148,17 @@ def _updated(program: Program, jaxpr: Any, constants, operand: Node, targets: No
 
 
 def _dynamic_slice(program: Program, operand: Node, *starts: Node, slice_sizes) -> Node:
-    return take(program, operand, _window(program, operand.shape, slice_sizes, starts[: len(slice_sizes)]))
+    return take(program, operand, _window(program, operand, slice_sizes, starts))
 
 
 def _dynamic_update_slice(program: Program, operand: Node, update: Node, *starts: Node) -> Node:
-    return _put(program, "set", operand, _window(program, operand.shape, update.shape, starts), update)
+    return _put(program, "set", operand, _window(program, operand, update.shape, starts), update)
+
+
+def _window(program: Program, operand: Node, sizes, starts: Sequence[Node]) -> Node:
+    """Returns the flat positions of one window with these corner indices."""
+    corner = program.gather(starts or [program.constant(0, "int")], np.arange(len(starts)))
+    return _windows(program, corner, operand.shape, sizes, None, range(len(starts)))[0]
 
 
 def _sort(program: Program, *nodes: Node, dimension: int, num_keys: int) -> list[Node]:
@@ -182,29 +171,6 @@ def _sort(program: Program, *nodes: Node, dimension: int, num_keys: int) -> list
     last = np.moveaxis(np.empty(shape), axis, -1).shape
     back = np.moveaxis(np.arange(nodes[0].size).reshape(last), -1, axis)
     return [program.gather([take(program, row, order)], back) for row in rows]
-
-
-def _window(program: Program, shape, sizes, starts: Sequence[Node]) -> Node:
-    """Returns the flat positions of a window whose corner is clamped into the operand."""
-    corner, _ = _corners(program, dict(enumerate(starts)), shape, sizes, 0)
-    return program.elementwise("add", corner, program.constant(_offsets(shape, range(len(shape)), sizes), "index"))
-
-
-def _index(program: Program, start: Node, upper: int) -> Node:
-    """Returns an index; unsigned 64-bit indices are clamped before conversion, because an index cannot hold them."""
-    if start.dtype == "unsigned_long":
-        start = program.elementwise("min", start, max(upper, 0))
-    return convert(program, start, "index")
-
-
-def _stride(shape, axis: int | np.integer) -> int:
-    return int(np.prod(shape[axis + 1 :], dtype=np.int64))
-
-
-def _offsets(shape, axes, sizes) -> np.ndarray:
-    """Returns the flat offsets [sizes] of a window along these axes."""
-    steps = [np.arange(size) * _stride(shape, axis) for axis, size in zip(axes, sizes, strict=True)]
-    return np.asarray(sum(np.ix_(*steps), np.zeros([1] * len(steps), np.int64)))
 
 
 RULES = {

@@ -75,7 +75,8 @@ def _inline(program: Program, closed: Any, args: Sequence[Node]) -> list[Node]:
             raise InputError(f"{error}{where}") from error
         for variable, result in zip(equation.outvars, results, strict=True):
             expected = tuple(variable.aval.shape), kind_of(variable.aval.dtype)
-            assert (result.shape, result.dtype) == expected, f"{equation.primitive.name} became {result}"
+            made = result.shape, result.dtype
+            assert made == expected, f"{equation.primitive.name} became {made}, not {expected}"
             nodes[variable] = result
     return [read(variable) for variable in jaxpr.outvars]
 
