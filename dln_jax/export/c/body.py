@@ -153,9 +153,8 @@ class Body:
     def finished(self, step: Node) -> None:
         """Frees the arrays whose last reader was this step."""
         for source in sorted(self.plan.reads.get(step, ()), key=lambda node: node.number):
-            left = self.plan.readers[source]
-            left.discard(step)
-            if not left and source in self.names:
+            self.plan.readers[source] -= 1
+            if not self.plan.readers[source] and source in self.names:
                 self._free.setdefault((source.region, source.dtype, source.size), []).append(self.names[source])
 
     def name(self, node: Node) -> str:
@@ -224,11 +223,7 @@ class Body:
 
     def projected(self, loop: Node) -> set[int]:
         """Returns the indices of a loop's results that something reads."""
-        return {
-            node.attribute
-            for node, mask in self.plan.needed.items()
-            if node.op == "project" and node.args[0] is loop and mask.any()
-        }
+        return {node.attribute for node in self.plan.nodes if node.op == "project" and node.args[0] is loop}
 
     @property
     def cost(self) -> Cost:
@@ -239,10 +234,6 @@ class Body:
             total(count), count["add"] + count["sub"] + fused, count["mul"] + fused, count["div"], count["sqrt"],
             functions, self.stack, self.unbounded,
         )  # fmt: skip
-
-    def uses(self, node: Node) -> bool:
-        """Returns whether anything reads a node."""
-        return node in self.plan.needed and bool(self.plan.needed[node].any())
 
 
 def _step(positions: np.ndarray, axis: int) -> int | None:

@@ -128,7 +128,7 @@ def _part(source: Source, program: Program, results: list[Node]) -> Called:
     body = body_of(source, program, results, {k: (f"a{k}_", False) for k in inputs}, targets, apart=True)
     parameters = [f"const {C_TYPES[inputs[k].dtype]} *RESTRICT a{k}_" for k in sorted(inputs)]
     parameters += [f"{C_TYPES[node.dtype]} *RESTRICT {target}" for node, target in zip(results, targets, strict=True)]
-    unused = [f"    (void)a{k}_;" for k in sorted(inputs) if not body.uses(inputs[k])]
+    unused = [f"    (void)a{k}_;" for k in sorted(inputs) if inputs[k] not in body.plan.nodes]
     unused += [f"    (void){target};" for result, target in zip(results, targets, strict=True) if not result.size]
     lines = "\n".join([*unused, *body.lines])
     text = f"({', '.join(parameters)})\n{{\n{lines}\n}}\n"
@@ -220,8 +220,7 @@ def _repeat(body: Body, node: Node) -> None:
     stacked = [index for index in sorted(body.projected(node)) if index >= carried]
     turn = f"{length - 1} - t{number}" if loop.reverse else f"t{number}"
     with body.loops({f"t{number}": length}):
-        counters = (counter for counter in body.plan.needed if counter.op == "counter" and counter.attribute == number)
-        if stacked or any(map(body.uses, counters)):
+        if stacked or any(node.op == "counter" and node.attribute == number for node in body.plan.nodes):
             body.line(f"const long long i_{number} = {turn};")
         region(body, (*node.region, number))
         for index in stacked:

@@ -4,6 +4,7 @@ Small arrays are unrolled into scalars, so that moving elements costs nothing an
 Others become loops over arrays; an elementwise operation with one reader is fused into its reader's loop.
 """
 
+from collections import Counter
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -31,14 +32,14 @@ class Plan(NamedTuple):
     """Nodes that are stored in an array; others are scalars."""
     root: dict[Node, Node]
     """Last node of the loop that computes an elementwise node."""
-    needed: dict[Node, np.ndarray]
-    """Which elements of every node are read."""
+    nodes: set[Node]
+    """Nodes with elements that the results need."""
     levels: dict[Node, int]
     """Length of the longest chain of products before a node."""
     reads: dict[Node | None, set[Node]]
     """Arrays of its region that a step reads; a loop reads the arrays that its body reads, and None the results."""
-    readers: dict[Node, set[Node | None]]
-    """Steps that read an array."""
+    readers: Counter[Node]
+    """Number of steps that read an array."""
     beside: dict[Node, Node]
     """Pairs of a sine and a cosine of the same scalar, in both directions."""
 
@@ -64,19 +65,14 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     arrays = {node for node in arrays if node.op not in ("input", "const")}
     root: dict[Node, Node] = _fused(nodes, readers, whole | set(results), unrolled, arrays)
     arrays -= {node for node, into in root.items() if into is not node}
-    levels, needed = _levels(nodes), _needed(program, nodes, unrolled, arrays, results)
-    order: dict[Region, list[Node]] = {}
-    in_order = sorted(nodes, key=lambda node: (levels[node], node in unrolled or node.op != "dot_general", node.number))
-    for node in in_order:
-        ends = root.get(node, node)
-        if needed[ends].any() and ends is node:
+    levels, order = _levels(nodes), {}
+    used = [node for node in nodes if node.size]
+    for node in sorted(used, key=lambda node: (levels[node], node in unrolled or node.op != "dot_general")):
+        if root.get(node, node) is node:
             order.setdefault(node.region, []).append(node)
     reads = _reads(program, nodes, arrays, root, results)
-    steps: dict[Node, set[Node | None]] = {}
-    for step, read in reads.items():
-        for source in read:
-            steps.setdefault(source, set()).add(step)
-    return Plan(order, unrolled, arrays, root, needed, levels, reads, steps, _sines(unrolled - arrays))
+    left = Counter(source for read in reads.values() for source in read)
+    return Plan(order, unrolled, arrays, root, set(used), levels, reads, left, _sines(unrolled - arrays))
 
 
 def _sines(scalars: set[Node]) -> dict[Node, Node]:
@@ -96,14 +92,16 @@ def _bodies(program: Program, node: Node) -> list[Loop]:
 
 def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[Node, list[Node]], set[Node], set[Node]]:
     """Returns the needed nodes in order, their readers, the nodes read whole, and those read by pointer."""
-    reached, waiting = set(), list(results)
+    reached, waiting = set(), [node for node in results if node.size]
     while waiting:
         node = waiting.pop()
         if node not in reached:
             reached.add(node)
             waiting += node.args
             for loop in _bodies(program, node):
-                waiting += [*loop.carries, *loop.conditions, *loop.results]
+                waiting += [*loop.carries, *loop.conditions, *loop.results[: len(loop.carries)]]
+            if node.op == "project":
+                waiting += [loop.results[node.attribute] for loop in _bodies(program, node.args[0])]
     nodes = sorted(reached, key=lambda node: node.number)
     readers: dict[Node, list[Node]] = {node: [] for node in nodes}
     whole, contiguous = {node for node in results if node.size > UNROLL_LIMIT}, set()
@@ -188,34 +186,3 @@ def _reads(program: Program, nodes, arrays, root, results) -> dict[Node | None, 
                 step = loops[node.region[depth]] if len(node.region) > depth else root.get(node, node)
                 reads.setdefault(step, set()).add(source)
     return reads
-
-
-def _needed(program: Program, nodes, unrolled, arrays, results) -> dict[Node, np.ndarray]:
-    """Returns which elements of every node are read."""
-    needed = {node: np.zeros(node.size, bool) for node in nodes}
-    projected: dict[Node, set[int]] = {}
-    for node in results:
-        needed[node][:] = True
-    for node in reversed(nodes):
-        mask = needed[node]
-        if not mask.any():
-            continue
-        if node in arrays:
-            mask[:] = True
-        for loop in _bodies(program, node):
-            for k, result in enumerate(loop.results):
-                if k < len(loop.carries) or k in projected.get(node, ()):
-                    needed[result][:] = True
-            for result in (*loop.conditions, *loop.carries):
-                needed[result][:] = True
-        if node.op == "project":
-            projected.setdefault(node.args[0], set()).add(node.attribute)
-        if node.op == "gather":
-            starts = np.cumsum([0, *(arg.size for arg in node.args)])
-            positions = np.asarray(node.value).ravel()[mask]
-            for arg, start in zip(node.args, starts, strict=False):
-                needed[arg][positions[(positions >= start) & (positions < start + arg.size)] - start] = True
-        else:
-            for arg in node.args:
-                needed[arg][:] = True
-    return needed
