@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dln_jax.export.c.interface import Cost
-from dln_jax.export.c.nodes import Node, Region, is_constant, read_source, strides, values
+from dln_jax.export.c.nodes import Node, Region, is_constant, read_source, steps, values
 from dln_jax.export.c.operations import OPERATIONS, total
 from dln_jax.export.c.plan import Plan
 from dln_jax.export.c.program import Program
@@ -187,24 +187,17 @@ class Body:
 
     def index(self, positions: np.ndarray, names: Sequence[str]) -> str:
         """Returns the C expression of an index, using a table unless it is linear in the loop variables."""
-        terms, first = [], 0
-        linear = strides(positions)
-        if linear is None:
-            # The table omits axes along which the index moves by equal steps.
-            even = {axis: step for axis in range(positions.ndim) if (step := _step(positions, axis)) is not None}
-            kept = positions[tuple(0 if axis in even else slice(None) for axis in range(positions.ndim))]
-            table, names_kept = self.source.table(kept.astype(np.int32), "int"), []
-            for axis, name in enumerate(names):
-                if axis in even:
-                    terms += [(even[axis], name)]
-                else:
-                    names_kept.append(name)
-            inside = self.index(np.arange(kept.size).reshape(kept.shape), names_kept)
-            terms.append((1, f"{table}[{inside}]"))
-        else:
-            first, terms = linear[0], list(zip(linear[1], names, strict=True))
-        texts = [f"{stride} * {name}" if stride != 1 else name for stride, name in terms if stride]
-        return " + ".join([*texts, *([str(first)] if first or not texts else [])]).replace("+ -", "- ")
+        every = steps(positions)
+        terms = [f"{step} * {name}" if step != 1 else name for step, name in zip(every, names, strict=True) if step]
+        # The table omits axes along which the index moves by equal steps.
+        first = positions[tuple(slice(None) if step is None else 0 for step in every)]
+        if first.ndim:
+            left = [name for step, name in zip(every, names, strict=True) if step is None]
+            inside = self.index(np.arange(first.size).reshape(first.shape), left)
+            terms.append(f"{self.source.table(first.astype(np.int32), 'int')}[{inside}]")
+        elif first or not terms:
+            terms.append(str(first))
+        return " + ".join(terms).replace("+ -", "- ")
 
     def literal(self, numbers: np.ndarray, dtype: str, names: Sequence[str]) -> str:
         """Returns the C expression of constants, inside loops over these variables."""
@@ -234,9 +227,3 @@ class Body:
             total(count), count["add"] + count["sub"] + fused, count["mul"] + fused, count["div"], count["sqrt"],
             functions, self.stack, self.unbounded,
         )  # fmt: skip
-
-
-def _step(positions: np.ndarray, axis: int) -> int | None:
-    """Returns the common step of all positions along an axis, or None if the steps differ."""
-    steps = np.diff(positions, axis=axis)
-    return None if steps.size and np.ptp(steps) else int(steps.flat[0]) if steps.size else 0

@@ -32,8 +32,7 @@ from jax import Array, lax
 from dln_jax.export.c.body import Body, Source
 from dln_jax.export.c.emit import body_of
 from dln_jax.export.c.interface import Leaf, argument_leaves, result_leaves
-from dln_jax.export.c.jaxprs import traced
-from dln_jax.export.c.lowering import program_of
+from dln_jax.export.c.lowering import program_of, traced
 from dln_jax.export.c.templates import CASADI_DECLARATIONS, CASADI_FUNCTION, stated
 from dln_jax.types import InputError
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from dln_jax.export.c.body import Body
-from dln_jax.export.c.nodes import UNROLL_LIMIT, Node, owners, read_source, strides
+from dln_jax.export.c.nodes import UNROLL_LIMIT, Node, owners, read_source, steps
 from dln_jax.export.c.operations import OPERATIONS, VECTORISED, expression
 from dln_jax.export.c.text import C_TYPES
 
@@ -103,22 +103,21 @@ def _variables(shape: Sequence[int]) -> list[str]:
     return [f"i{axis}_" for axis in range(len(shape))]
 
 
-def _steps(body: Body, node: Node, positions: np.ndarray) -> tuple[int, ...] | None:
-    """Returns the strides of a read, or None if it needs a table."""
+def _steps(body: Body, node: Node, positions: np.ndarray) -> list[int | None]:
+    """Returns the steps of a read along each axis, with None where it needs a table."""
     if node.op == "gather" and node not in body.plan.arrays:
         positions = np.asarray(np.asarray(node.value).ravel()[positions])
-    linear = strides(positions)
-    return None if linear is None else linear[1]
+    return steps(positions)
 
 
-def _merged(shape: Sequence[int], steps: list[tuple[int, ...] | None]) -> list[int]:
+def _merged(shape: Sequence[int], steps: list[list[int | None]]) -> list[int]:
     """Returns the shape with adjacent axes merged where all reads allow it; at least one axis remains."""
     result: list[int] = []
     kept: list[int] = []
     for axis, extent in enumerate(shape):
         if extent == 1 and len(shape) > 1 and (result or axis + 1 < len(shape)):
             continue
-        if kept and all(step is not None and step[kept[-1]] == step[axis] * extent for step in steps):
+        if kept and all(None not in step and step[kept[-1]] == (step[axis] or 0) * extent for step in steps):
             result[-1] *= extent
             kept[-1] = axis
         else:
@@ -165,7 +164,7 @@ def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:
 
     def split(box: np.ndarray) -> list[np.ndarray]:
         at, of = flat[box], owner[box]
-        if strides(at) is not None and (of == of.flat[0]).all():
+        if None not in steps(at) and (of == of.flat[0]).all():
             return [box]
         cuts = {axis: _runs(np.moveaxis(at, axis, 0), np.moveaxis(of, axis, 0)) for axis in range(at.ndim)}
         axis = min(

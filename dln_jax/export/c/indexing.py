@@ -167,7 +167,10 @@ def _sort(program: Program, *nodes: Node, dimension: int, num_keys: int) -> list
     if shape[axis] < 2:
         return list(nodes)
     rows = [rows_of(program, node, (axis,)) for node in nodes]
-    order = program.make("order", rows[0].shape, "index", rows[:num_keys])
+    *others, last_key = rows[:num_keys]
+    order = program.make("order", last_key.shape, "index", [last_key])
+    for key in reversed(others):  # the sort is stable, so the first key comes last
+        order = take(program, order, program.make("order", key.shape, "index", [take(program, key, order)]))
     last = np.moveaxis(np.empty(shape), axis, -1).shape
     back = np.moveaxis(np.arange(nodes[0].size).reshape(last), -1, axis)
     return [program.gather([take(program, row, order)], back) for row in rows]

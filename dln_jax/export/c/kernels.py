@@ -1,6 +1,5 @@
 """C of reductions, scattered updates and sorts; functions on matrices are in `factorisations`."""
 
-import re
 from collections.abc import Collection
 from string import Template
 
@@ -14,15 +13,14 @@ from dln_jax.export.c.operations import OPERATIONS
 from dln_jax.export.c.products import summed
 from dln_jax.export.c.text import C_TYPES
 
-_PREFIX = "order_"
 _ORDER = Template("""
-/* Places of each row's elements [rows, n] in ascending order of their keys, by merging; NaN last */
-static inline int ${name}_before(long long i, long long j$keys)
+/* Places of each row's elements [rows, n] in ascending order, equal ones as they were, by merging; NaN last */
+static inline int elementary_before_$kind($c x, $c y)
 {
-$comparisons    return 0;
+    return !(y <= x) && +x == +x;
 }
 
-static void $name(int rows, int n, long long *merged, long long *order$keys)
+static void elementary_order_$kind(int rows, int n, const $c *key, long long *merged, long long *order)
 {
     for (int row = 0; row < rows; ++row, order += n) {
         for (int k = 0; k < n; ++k) order[k] = (long long)row * n + k;
@@ -32,7 +30,8 @@ static void $name(int rows, int n, long long *merged, long long *order$keys)
                 const long long last = middle + width < n ? middle + width : n;
                 long long i = first, j = middle;
                 for (long long k = first; k < last; ++k) {
-                    const int second = i == middle || (j < last && ${name}_before(order[j], order[i]$passed));
+                    const int second = j < last
+                        && (i == middle || elementary_before_$kind(key[order[j]], key[order[i]]));
                     merged[k] = second ? order[j++] : order[i++];
                 }
             }
@@ -44,20 +43,8 @@ static void $name(int rows, int n, long long *merged, long long *order$keys)
 
 
 def orderings(names: Collection[str]) -> str:
-    """Returns the C functions with these names, which sort by keys of the kinds in it, the first taking precedence."""
-    text = ""
-    for name in sorted(name for name in names if name.startswith(_PREFIX)):
-        kinds = re.findall("|".join(sorted(C_TYPES, key=len, reverse=True)), name.removeprefix(_PREFIX))
-        comparisons = ""
-        for place, kind in enumerate(kinds):
-            for first, second, before in (("i", "j", 1), ("j", "i", 0)):
-                a, b = f"key{place}[{first}]", f"key{place}[{second}]"
-                nan_last = f" || ({a} == {a} && {b} != {b})" if kind == "real" else ""
-                comparisons += f"    if ({a} < {b}{nan_last}) return {before};\n"
-        keys = "".join(f", const {C_TYPES[kind]} *key{place}" for place, kind in enumerate(kinds))
-        passed = "".join(f", key{place}" for place in range(len(kinds)))
-        text += _ORDER.substitute(name=f"elementary_{name}", keys=keys, passed=passed, comparisons=comparisons)
-    return text
+    """Returns the C functions with these names, which sort by keys of a kind."""
+    return "".join(_ORDER.substitute(kind=kind, c=c) for kind, c in C_TYPES.items() if f"order_{kind}" in names)
 
 
 def _reduction(body: Body, node: Node) -> None:
@@ -66,7 +53,11 @@ def _reduction(body: Body, node: Node) -> None:
     combine, op = combination(node), node.op.partition("_")[2]
     body.spend(**{op: rows * (count - 1)} if node.dtype == "real" else {})
     at, kind = np.arange(a.size).reshape(a.shape), C_TYPES[node.dtype]
-    target = _kept(body, node)
+    if node in body.plan.arrays:
+        target = f"{body.kept(node)}[r_]"
+    else:
+        target = body.name(node)
+        body.declared(target, node.dtype, 0)
     with body.loops({"r_": rows}):
         if node.op == "reduce_add" and node.dtype == "real" and count >= 16:
             summed(body, count, 8, lambda k, total: f"{total} + {body.read(a, at, ['r_', k])}")
@@ -76,34 +67,6 @@ def _reduction(body: Body, node: Node) -> None:
                 body.line(f"const {kind} term_ = {body.read(a, at, ['r_', 'k_'])};")
                 body.line(f"sum_ = {combine('sum_', 'term_')};")
         body.line(f"{target} = sum_;")
-
-
-def _arg(body: Body, node: Node) -> None:
-    """Writes argmax or argmin: the first extremum, or the first NaN if there is one."""
-    (a,) = node.args
-    rows, count = a.shape
-    at, kind, better = np.arange(a.size).reshape(a.shape), C_TYPES[a.dtype], ">" if node.op == "argmax" else "<"
-    test = f"x_ {better} best_"
-    if a.dtype == "real":  # only real numbers may be NaN
-        test = f"({test} || x_ != x_) && best_ == best_"
-    target = _kept(body, node)
-    with body.loops({"r_": rows}):
-        body.line("int chosen_ = 0;")
-        body.line(f"{kind} best_ = {body.read(a, at[:, 0], ['r_'])};")
-        with body.block(f"for (int k_ = 1; k_ < {count}; ++k_)"):
-            body.line(f"const {kind} x_ = {body.read(a, at, ['r_', 'k_'])};")
-            with body.block(f"if ({test})"):
-                body.line("best_ = x_;")
-                body.line("chosen_ = k_;")
-        body.line(f"{target} = ({C_TYPES[node.dtype]})chosen_;")
-
-
-def _kept(body: Body, node: Node) -> str:
-    """Declares the array or scalar for a node, and returns the C of its element in row `r_`."""
-    if node in body.plan.arrays:
-        return f"{body.kept(node)}[r_]"
-    body.declared(body.name(node), node.dtype, 0)
-    return body.name(node)
 
 
 def _put(body: Body, node: Node) -> None:
@@ -121,19 +84,17 @@ def _put(body: Body, node: Node) -> None:
 
 
 def _order(body: Body, node: Node) -> None:
-    """Writes a call of the function that sorts by the keys of a node."""
+    (key,) = node.args
     rows, n = node.shape
-    name, merged = _PREFIX + "_".join(key.dtype for key in node.args), f"v{node.number}_merged"
+    merged = f"v{node.number}_merged"
     body.declared(merged, "index", n)
     target = body.kept(node)
-    body.line(f"elementary_{name}({rows}, {n}, {merged}, {target}, {', '.join(map(body.pointer, node.args))});")
+    body.line(f"elementary_order_{key.dtype}({rows}, {n}, {body.pointer(key)}, {merged}, {target});")
 
 
 WRITERS = {
     **{f"reduce_{op}": _reduction for op in ("add", "mul", "max", "min", "and", "or", "xor")},
     **{f"put_{op}": _put for op in ("set", "add", "sub", "mul", "min", "max")},
-    "argmax": _arg,
-    "argmin": _arg,
     "order": _order,
     **factorisations.WRITERS,
 }

@@ -1,21 +1,25 @@
-"""Lowers a jaxpr to a program: inlines calls, keeps control flow, and applies a rule for every primitive."""
+"""Traces functions, and lowers their jaxprs to programs: inlines calls and applies a rule for every primitive."""
 
 import inspect
-from collections.abc import Collection, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
+import jax
 import numpy as np
 from jax.dtypes import float0
+from jax.extend import core
 
 from dln_jax.export.c import control_flow, indexing, primitives
-from dln_jax.export.c.jaxprs import closed_jaxpr, expanded, implementation, is_error_of_equinox, made_at
 from dln_jax.export.c.nodes import Node, is_constant, values
 from dln_jax.export.c.operations import OPERATIONS
 from dln_jax.export.c.program import Program
 from dln_jax.export.c.text import PRECISIONS, failure, kind_of
 from dln_jax.types import InputError
 
+_LARGE_CALL = 600
+"""A jitted function with at least this many equations that is called several times becomes a C function."""
 _CALLS = {
     "jit": "jaxpr", "closed_call": "call_jaxpr", "remat2": "jaxpr", "eval_jaxpr": "call_jaxpr",
     "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "custom_vmap_call": "call",
@@ -35,14 +39,64 @@ _REFUSED = {
 }
 
 
+def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, Any]:
+    """Returns the closed jaxpr of a function, and the tree of its results.
+
+    Raises:
+        InputError: the function has side effects, integers beyond 64 bits, or branches of Python on an argument.
+    """
+    try:
+        closed, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
+    except jax.errors.ConcretizationTypeError as error:
+        raise InputError(
+            "the function needs the value of an argument in Python, such as for `if x > 0`; write jnp.where or lax.cond"
+        ) from error
+    except OverflowError as error:
+        raise InputError(f"a whole number is out of range ({error}); C has integers of up to 64 bits") from error
+    if closed.effects:
+        raise InputError(f"the function has side effects ({', '.join(map(str, closed.effects))}); C export takes none")
+    return closed, shapes
+
+
+def repeated_calls(every: Sequence[Any]) -> set[int]:
+    """Returns the `id` values of large jaxprs that these closed jaxprs call several times.
+
+    Calls of one jitted function with arguments of equal types share a jaxpr, which JAX keeps.
+    """
+    sizes: dict[int, int] = {}
+    counts: Counter[int] = Counter()
+
+    def size(jaxpr: Any) -> int:
+        """Returns the number of equations, including those of calls."""
+        if id(jaxpr) not in sizes:
+            total = 0
+            for equation in _closed(jaxpr).jaxpr.eqns:
+                values = equation.params.values() if _of_jax(equation.primitive) else ()
+                inside = [inner for value in values for inner in _jaxprs(value)]
+                counts.update(map(id, inside))
+                total += max(1, sum(map(size, inside)))
+            sizes[id(jaxpr)] = total
+        return sizes[id(jaxpr)]
+
+    for closed in every:
+        size(closed)
+    return {identity for identity, count in counts.items() if count > 1 and sizes[identity] >= _LARGE_CALL}
+
+
+def _jaxprs(value: Any) -> list[Any]:
+    if isinstance(value, list | tuple):
+        return [jaxpr for item in value for jaxpr in _jaxprs(item)]
+    return [value] if hasattr(value, "eqns") or hasattr(value, "jaxpr") else []
+
+
 def program_of(
     closed: Any, repeated: Collection[int] = (), *, precision: str = "f64", finite: bool = False
 ) -> tuple[Program, list[Node], list[Node]]:
     """Returns the program of a closed jaxpr, its inputs and its results.
 
     Args:
-        closed: the jaxpr, as `jaxprs.traced` returns it.
-        repeated: `id` values of jaxprs whose calls stay calls in the program.
+        closed: the jaxpr, as `traced` returns it.
+        repeated: `id` values of jaxprs whose calls stay calls in the program, from `repeated_calls`.
         precision: f32 or f64.
         finite: arguments and intermediate results are finite numbers.
 
@@ -71,7 +125,7 @@ def _inline(program: Program, closed: Any, args: Sequence[Node]) -> list[Node]:
         try:
             results = _apply(program, equation, [read(variable) for variable in equation.invars])
         except InputError as error:
-            where = "" if " (made at " in str(error) else made_at(equation)
+            where = "" if " (made at " in str(error) else _made_at(equation)
             raise InputError(f"{error}{where}") from error
         for variable, result in zip(equation.outvars, results, strict=True):
             expected = tuple(variable.aval.shape), kind_of(variable.aval.dtype)
@@ -89,7 +143,8 @@ def _constant(program: Program, value: Any, aval: Any) -> Node:
 
 
 def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
-    name, parameters = equation.primitive.name, equation.params
+    primitive, parameters = equation.primitive, equation.params
+    name = primitive.name
     for variable in equation.outvars:
         if not all(isinstance(size, int | np.integer) for size in getattr(variable.aval, "shape", ())):
             raise InputError(f"an array has shape {variable.aval.shape}; expected sizes that are known beforehand")
@@ -97,20 +152,30 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
         inner = parameters[_CALLS[name]]
         if id(inner) in program.repeated:
             return _call(program, inner, args)
-        return _inline(program, closed_jaxpr(inner), args)
+        return _inline(program, _closed(inner), args)
     if name == "call_hi_primitive":
-        return _inline(program, expanded(parameters["_prim"]), args)
-    results = [variable.aval for variable in equation.outvars]
-    if is_error_of_equinox(equation):
-        return [_failed(program, aval) for aval in results]
+        high = parameters["_prim"]
+        return primitives.composed(
+            program, lambda *leaves: jax.tree.leaves(high.expand(*jax.tree.unflatten(high.in_tree, leaves))), args
+        )
+    if _is_error_of_equinox(equation):
+        return [_failed(program, variable.aval) for variable in equation.outvars]
     if name in _RULES or name in OPERATIONS:
         return _ruled(program, equation, args)
     if why := next((reason for part, reason in _REFUSED.items() if part in name), None):
         raise InputError(f"'{name}' is {why}")
-    inner = implementation(equation, [values(arg) if is_constant(arg) else None for arg in args])
-    if inner is None:
+    if _of_jax(primitive):
         raise InputError(f"the primitive '{name}' has no C")
-    return _inline(program, inner, [arg for arg in args if not is_constant(arg)])
+
+    def run(*unknown: Any) -> list[Any]:
+        left = iter(unknown)
+        return jax.tree.leaves(
+            primitive.impl(*(next(left) if fixed is None else fixed for fixed in known), **parameters)
+        )
+
+    # Another library's primitive, such as Equinox's, may need the values of constant arguments.
+    known = [values(arg) if is_constant(arg) else None for arg in args]
+    return primitives.composed(program, run, [arg for arg in args if not is_constant(arg)])
 
 
 def _ruled(program: Program, equation: Any, args: list[Node]) -> list[Node]:
@@ -163,6 +228,31 @@ def _platform(program: Program, *, platforms) -> Node:
     """Returns the index of the CPU's branch, or of the default branch."""
     places = [k for k, parameter in enumerate(platforms) if parameter is None or "cpu" in parameter]
     return program.constant(np.int32(places[0]), "int")
+
+
+def _of_jax(primitive: Any) -> bool:
+    return getattr(primitive.impl, "func", primitive.impl).__module__.partition(".")[0] == "jax"
+
+
+def _is_error_of_equinox(equation: Any) -> bool:
+    """Returns whether an equation is the callback that raises the error of `equinox.error_if`."""
+    if equation.primitive.name != "pure_callback":
+        return False
+    callback = equation.params["callback"]
+    return getattr(callback, "callback_func", callback).__module__ == "equinox._errors"
+
+
+def _closed(jaxpr: Any) -> Any:
+    """Returns a jaxpr in closed form; an open jaxpr has no constants."""
+    return jaxpr if hasattr(jaxpr, "consts") else core.ClosedJaxpr(jaxpr, ())
+
+
+def _made_at(equation: Any) -> str:
+    """Returns " (made at FILE:LINE)" for the user's code that made an equation, or "" if JAX kept no traceback."""
+    traceback = equation.source_info.traceback
+    frames = [] if traceback is None else list(traceback.frames)
+    users = [frame for frame in frames if "/jax/" not in frame.file_name and "/dln_jax/export/" not in frame.file_name]
+    return f" (made at {users[0].file_name}:{users[0].line_num})" if users else ""
 
 
 _RULES = {

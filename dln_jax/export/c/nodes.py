@@ -73,9 +73,7 @@ def is_constant(node: Node) -> bool:
 
 def values(node: Node) -> np.ndarray:
     """Returns the value of a constant node."""
-    if node.op == "const":
-        return np.asarray(node.value)
-    return np.asarray(np.concatenate([values(arg).ravel() for arg in node.args])[np.asarray(node.value)])
+    return known(node)[1].reshape(node.shape)
 
 
 def is_all(node: Node, number: Any) -> bool:
@@ -85,10 +83,8 @@ def is_all(node: Node, number: Any) -> bool:
 
 def is_uniform(node: Node) -> bool:
     """Returns whether all elements are known to be equal."""
-    if node.op == "const":
-        array = np.asarray(node.value)
-        return array.size > 0 and bool((array == array.flat[0]).all())
-    return node.op == "gather" and node.value is not None and bool((node.value == node.value.flat[0]).all())
+    array = node.value
+    return array is not None and array.size > 0 and bool((array == array.flat[0]).all())
 
 
 def known(node: Node) -> tuple[np.ndarray, np.ndarray]:
@@ -110,21 +106,13 @@ def zeros(node: Node) -> np.ndarray:
 
 def is_direct(node: Node) -> bool:
     """Returns whether the positions of a gather are linear in the indices of a loop."""
-    return len(node.args) == 1 and node.value is not None and strides(node.value) is not None
+    return len(node.args) == 1 and node.value is not None and None not in steps(node.value)
 
 
-def strides(positions: np.ndarray) -> tuple[int, tuple[int, ...]] | None:
-    """Returns (first, steps) such that positions = first + sum_a steps_a i_a, or None if there are none."""
-    if positions.size == 0:
-        return 0, (0,) * positions.ndim
-    first = int(positions.flat[0])
-    steps = []
-    expected = np.array(first)
-    for axis, extent in enumerate(positions.shape):
-        corner = (0,) * axis + (1,) + (0,) * (positions.ndim - axis - 1)
-        steps.append(int(positions[corner]) - first if extent > 1 else 0)
-        expected = expected[..., None] + steps[-1] * np.arange(extent)
-    return (first, tuple(steps)) if np.array_equal(positions, expected) else None
+def steps(positions: np.ndarray) -> list[int | None]:
+    """Returns the step of the positions along each axis, or None where it is not the same everywhere."""
+    every = [np.diff(positions, axis=axis) for axis in range(positions.ndim)]
+    return [0 if not step.size else None if np.ptp(step) else int(step.flat[0]) for step in every]
 
 
 def owners(sources: Sequence[Node], positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -88,7 +88,9 @@ OPERATIONS = {
     "add": Operation("({0} + {1})", np.add, integer="(({c})(({u}){0} + ({u}){1}))"),
     "sub": Operation("({0} - {1})", np.subtract, integer="(({c})(({u}){0} - ({u}){1}))"),
     "mul": Operation("({0} * {1})", np.multiply, integer="(({c})(({u}){0} * ({u}){1}))"),
-    "multiply_add": Operation("MULTIPLY_ADD({0}, {1}, {2})", lambda a, b, c: a * b + c, 2),
+    "multiply_add": Operation(
+        "MULTIPLY_ADD({0}, {1}, {2})", lambda a, b, c: a * b + c, 2, integer="(({c})(({u}){2} + ({u}){0} * ({u}){1}))"
+    ),
     "div": Operation("({0} / {1})", _by_xla("div", np.divide), integer="elementary_quotient_{kind}({0}, {1})"),
     "rem": _function("fmod", _by_xla("rem", np.fmod), arguments=2)._replace(
         integer="elementary_remainder_{kind}({0}, {1})"

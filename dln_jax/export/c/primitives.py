@@ -92,14 +92,19 @@ def _power(program: Program, x: Node, exponent: Node, *, kind: str) -> Node:
     return program.elementwise("pow", *(convert(program, node, kind) for node in (x, exponent)))
 
 
+def composed(program: Program, function: Callable[..., Any], nodes: Sequence[Node]) -> list[Node]:
+    """Returns the results of a JAX function."""
+    types = [program.real if node.dtype == "real" else NUMPY_TYPES[node.dtype] for node in nodes]
+    examples = [jax.ShapeDtypeStruct(node.shape, dtype) for node, dtype in zip(nodes, types, strict=True)]
+    return program.inline(program, jax.make_jaxpr(function)(*examples), nodes)
+
+
 def _composed(function: Callable[..., Any]) -> Rule:
     """Returns the rule of a primitive that a JAX function of the same arguments composes of others."""
 
     @functools.wraps(function)
     def rule(program: Program, *nodes: Node, **parameters: Any) -> list[Node]:
-        types = [program.real if node.dtype == "real" else NUMPY_TYPES[node.dtype] for node in nodes]
-        examples = [jax.ShapeDtypeStruct(node.shape, dtype) for node, dtype in zip(nodes, types, strict=True)]
-        return program.inline(program, jax.make_jaxpr(functools.partial(function, **parameters))(*examples), nodes)
+        return composed(program, functools.partial(function, **parameters), nodes)
 
     return rule
 
@@ -155,14 +160,15 @@ def _reduce_precision(program: Program, x: Node, *, exponent_bits: int, mantissa
 def _dot_general(program: Program, a: Node, b: Node, *, dimension_numbers, precision: Any, kind: str) -> Node:
     if isinstance(precision, lax.DotAlgorithm | lax.DotAlgorithmPreset):  # it may round operands and sums
         raise InputError(f"the primitive 'dot_general' has no C with precision={precision}")
-    a, b = (convert(program, node, kind) for node in (a, b))
+    counted = "int" if kind == "bool" else kind
+    a, b = (convert(program, node, counted) for node in (a, b))
     (a_sum, b_sum), (a_batch, b_batch) = dimension_numbers
     a_free, b_free = _others(a, (*a_sum, *a_batch)), _others(b, (*b_sum, *b_batch))
     product = program.dot_general(
         grouped(program, a, a_batch, a_free, a_sum), grouped(program, b, b_batch, b_sum, b_free)
     )
     shape = [a.shape[axis] for axis in (*a_batch, *a_free)] + [b.shape[axis] for axis in b_free]
-    return program.reshape(product, shape)
+    return convert(program, program.reshape(product, shape), kind)
 
 
 def _reduction(name: str) -> Rule:
@@ -181,28 +187,26 @@ def _reduction(name: str) -> Rule:
     return rule
 
 
-def _arg(name: str) -> Rule:
-    def rule(program: Program, node: Node, *, axes, kind: str) -> Node:
-        (axis,) = map(int, axes)
-        rows = rows_of(program, node, (axis,))
-        made = program.make(name, rows.shape[:1], kind, [rows])
-        return program.reshape(made, node.shape[:axis] + node.shape[axis + 1 :])
+def _place_of(best: Callable[..., Any]) -> Rule:
+    """Returns the rule of the first place of a row's largest or smallest element, or of its first NaN."""
 
-    return rule
+    def place(x, *, axes, index_dtype):
+        (axis,) = axes
+        chosen = (x == best(x, axis=axis, keepdims=True)) | (x != x)
+        places = lax.broadcasted_iota(index_dtype, x.shape, axis)
+        return jnp.where(chosen, places, x.shape[axis]).min(axis)
+
+    return _composed(place)
 
 
-def _cumulative(op: str) -> Rule:
+def _cumulative(combine: Callable[..., Any]) -> Rule:
     """Returns the rule of a cumulative operation, unrolled along the axis."""
 
-    def rule(program: Program, node: Node, *, axis: int, reverse: bool) -> Node:
-        index = np.moveaxis(np.arange(node.size).reshape(node.shape), axis, 0)
+    def totals(x, *, axis, reverse):
         order = slice(None, None, -1 if reverse else 1)
-        pieces = [program.gather([node], positions) for positions in index[order]]
-        totals = list(accumulate(pieces, functools.partial(program.elementwise, op)))
-        joined = np.arange(node.size).reshape(index.shape)
-        return program.gather(totals[order], np.moveaxis(joined, 0, axis))
+        return jnp.stack([*accumulate(jnp.unstack(x, axis=axis)[order], combine)][order], axis)
 
-    return rule
+    return _composed(totals)
 
 
 def _items(program: Program, node: Node, rank: int = 2) -> list[Node]:
@@ -323,8 +327,12 @@ RULES: dict[str, Rule] = {
     "split": _moved(_split),
     "dot_general": _dot_general,
     **{f"reduce_{name}": _reduction(op) for name, op in _OF_REDUCTIONS.items()},
-    **{name: _arg(name) for name in ("argmax", "argmin")},
-    **{f"cum{name}": _cumulative(_OF_REDUCTIONS[name]) for name in ("sum", "prod", "max", "min")},
+    "argmax": _place_of(jnp.max),
+    "argmin": _place_of(jnp.min),
+    "cumsum": _cumulative(jnp.add),
+    "cumprod": _cumulative(jnp.multiply),
+    "cummax": _cumulative(jnp.maximum),
+    "cummin": _cumulative(jnp.minimum),
     "geqrf": _geqrf,
     "householder_product": _householder_product,
     "ormqr": _composed(_ormqr),

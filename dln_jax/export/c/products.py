@@ -11,7 +11,7 @@ import numpy as np
 
 from dln_jax.export.c.body import Body
 from dln_jax.export.c.nodes import Node, is_constant, values
-from dln_jax.export.c.operations import expression, on_kind
+from dln_jax.export.c.operations import expression
 from dln_jax.export.c.text import C_TYPES
 
 _LANES = {"f64": 4, "f32": 8}
@@ -19,13 +19,6 @@ _TILE = 64
 """Number of columns summed at once; gcc allocates registers better for wide blocks."""
 _ROWS = 16
 """Largest number of rows with separate sums; more rows are a loop over rows."""
-
-
-def _multiply_add(a: str, b: str, total: str, dtype: str = "real") -> str:
-    """Returns the C of total + a b; for booleans, of total or (a and b)."""
-    if dtype == "real":
-        return f"MULTIPLY_ADD({a}, {b}, {total})"
-    return expression(on_kind("add", dtype), dtype, total, expression(on_kind("mul", dtype), dtype, a, b))
 
 
 def summed(body: Body, count: int, parts: int, add: Callable[[str, str], str]) -> None:
@@ -133,7 +126,7 @@ def _many(body: Body, node: Node) -> None:
                 body.line(f"const {kind} x_ = {first};")
                 with body.loops({"c_": width}):
                     text = body.read(b, ((i * count + k) * columns + start + c)[:, 0], ["b_", "k_", "c_"])
-                    body.line(f"s_[c_] = {_multiply_add('x_', text, 's_[c_]', node.dtype)};")
+                    body.line(f"s_[c_] = {expression('multiply_add', node.dtype, 'x_', text, 's_[c_]')};")
             target = body.index(((i * m + j) * columns + start + c)[:, :, 0], ["b_", "r_", "c_"])
             body.line(f"for (int c_ = 0; c_ < {width}; ++c_) {body.name(node)}[{target}] = s_[c_];")
 
@@ -148,7 +141,7 @@ def _dots(body: Body, node: Node) -> None:
 
     def add(index: str, total: str) -> str:
         first = body.read(a, (i * m + j) * count + k, ["b_", "r_", index])
-        return _multiply_add(first, body.read(b, (i * count + k)[:, 0], ["b_", index]), total)
+        return f"MULTIPLY_ADD({first}, {body.read(b, (i * count + k)[:, 0], ['b_', index])}, {total})"
 
     with body.loops({"b_": batch, "r_": m}):
         summed(body, count, parts, add)

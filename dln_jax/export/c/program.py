@@ -9,9 +9,9 @@ gathers and selections at constant indices) is a `gather`: it names the source o
 | `gather` | elements of the sources, laid end to end, at the positions `value` |
 | a name in `operations.OPERATIONS` | elementwise, on arguments of one shape or scalars; small results are scalars |
 | `dot_general` | A [b, m, k], B [b, k, n] -> sum over k [b, m, n] |
-| `reduce_*`, `arg*` | reduction over the last axis of the argument [o, r] |
+| `reduce_*` | reduction over the last axis of the argument [o, r] |
 | `take` | flat elements of the first argument at the second's indices |
-| `order` | flat indices that sort rows by keys [o, n], the first key first |
+| `order` | flat indices that sort rows [o, n] |
 | `put_*` | the first argument [n] with updates (third) at flat indices (second); negative ones are dropped |
 | `cholesky`, `triangular_solve`, `lu` | of a small dense matrix |
 | `permutation` | the order of rows after the exchanges of `lu` |
@@ -237,10 +237,7 @@ class Program:
         (a, b), *rest = zip(left, right, strict=True)
         total = self.elementwise("mul", a, b)
         for a, b in rest:
-            if a.dtype == "real":
-                total = self.elementwise("multiply_add", a, b, total)
-            else:
-                total = self.elementwise("add", total, self.elementwise("mul", a, b))
+            total = self.elementwise("multiply_add", a, b, total)
         return total
 
     def scalars(self, node: Node) -> list[Node]:

@@ -27,8 +27,7 @@ from dln_jax.export.c.interface import (
     description,
     result_leaves,
 )
-from dln_jax.export.c.jaxprs import repeated_calls, traced
-from dln_jax.export.c.lowering import program_of
+from dln_jax.export.c.lowering import program_of, repeated_calls, traced
 from dln_jax.export.c.templates import CASADI_ABOUT, CASADI_BUILD, NEEDED, about, cmake, demo, header, preamble
 from dln_jax.export.c.text import PRECISIONS, check_name, comment, kind_of
 from dln_jax.export.exports import write_exports

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from comparison import needs_compiler
 
-from dln_jax.export.c import jaxprs
+from dln_jax.export.c import lowering
 from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c, source_files
@@ -18,7 +18,7 @@ from dln_jax.scenes.pendulums import chain
 @pytest.fixture(autouse=True)
 def small_functions_are_called(monkeypatch):
     """Not inlined, as only large ones are otherwise."""
-    monkeypatch.setattr(jaxprs, "_LARGE_CALL", 6)
+    monkeypatch.setattr(lowering, "_LARGE_CALL", 6)
 
 
 def model(weights):
