@@ -32,11 +32,7 @@ class Called(NamedTuple):
     name: str
     results: list[Node]
     text: str
-    operations: Counter[str]
-    unbounded: int
-    stack: int
-    calls: set[Any]
-    """Keys (in the source) of the functions that it calls, directly or indirectly."""
+    body: "Body"
 
 
 @dataclass
@@ -93,6 +89,8 @@ class Body:
     """Keys (in the source) of the functions that it calls, directly or indirectly."""
     names: dict[Node, str] = field(default_factory=dict)
     """Names of the arrays that hold nodes."""
+    done: set[Node] = field(default_factory=set)
+    """Nodes that are written."""
     _free: dict[tuple[Region, str, int], list[str]] = field(default_factory=dict)
     """Arrays that later lines may reuse, by region, kind and size."""
     _depth: int = 1

@@ -22,21 +22,21 @@ _BOXES = 6
 """Largest number of boxes that become separate loops; more are read through tables of positions."""
 
 
-def unrolled(body: Body, node: Node) -> set[Node]:
-    """Writes a scalar as an expression of variables and of the scalars fused into it; returns the nodes written."""
+def unrolled(body: Body, node: Node) -> None:
+    """Writes a scalar as an expression of variables and of the scalars fused into it, or a sine with its cosine."""
     if node in body.plan.beside and not body.source.libm:
         pair = sorted((node, body.plan.beside[node]), key=lambda scalar: scalar.op, reverse=True)
         body.spend(sin=1)
         for scalar in pair:
             body.declared(body.name(scalar), "real", 0)
         body.line("elementary_sin_cos({}, &{}, &{});".format(body.read(node.args[0], _FIRST), *map(body.name, pair)))
-        return {*pair}
+        body.done.update(pair)
+        return
     text = _scalar(body, node, node)
     if node in body.plan.arrays:
         body.line(f"{body.kept(node)}[0] = {text};")
     else:
         body.declared(body.name(node), node.dtype, 0, text)
-    return {node}
 
 
 def _scalar(body: Body, node: Node, root: Node) -> str:

@@ -16,6 +16,8 @@ from dln_jax.export.c.program import Program
 
 _DEPTH = 16
 """Largest depth of a scalar expression; compilers limit the nesting of parentheses."""
+_GIVEN = ("input", "const", "carry", "counter", "project")
+"""Operations whose values are there when a region begins, or when the loop that they name has ended."""
 _FACTORED = ("cholesky", "triangular_solve", "permutation", "geqrf", "householder_product", "eigh")
 PLAIN_MEMORY = ("take", "order", "lu", "call", *_FACTORED)
 """Operations that read arguments through a pointer."""
@@ -47,7 +49,8 @@ class Plan(NamedTuple):
 def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     """Returns the plan for a program with these results."""
     results = list(results)
-    nodes, readers, whole, contiguous = _reached(program, results)
+    nodes = needed_by(program, results)
+    readers, whole, contiguous = _readers(program, results, nodes)
     unrolled = {node for node in nodes if _is_unrolled(node)}
     arrays, followed = set(contiguous), set()
     # Loops read arrays. A gather that a loop cannot index linearly is first copied to an array.
@@ -67,8 +70,9 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     arrays -= {node for node, into in root.items() if into is not node}
     levels, order = _levels(nodes), {}
     used = [node for node in nodes if node.size]
-    for node in sorted(used, key=lambda node: (levels[node], node in unrolled or node.op != "dot_general")):
-        if root.get(node, node) is node:
+    for node in sorted(used, key=lambda node: (levels[node], node.op != "dot_general")):
+        written = node in arrays if node.op == "gather" else node.op not in _GIVEN
+        if written and root.get(node, node) is node:
             order.setdefault(node.region, []).append(node)
     reads = _reads(program, nodes, arrays, root, results)
     left = Counter(source for read in reads.values() for source in read)
@@ -90,8 +94,8 @@ def _bodies(program: Program, node: Node) -> list[Loop]:
     return [program.loops[number] for number in _numbers(node)]
 
 
-def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[Node, list[Node]], set[Node], set[Node]]:
-    """Returns the needed nodes in order, their readers, the nodes read whole, and those read by pointer."""
+def needed_by(program: Program, results: Iterable[Node]) -> list[Node]:
+    """Returns all nodes that the results need in order, those in the bodies of loops and branches too."""
     reached, waiting = set(), [node for node in results if node.size]
     while waiting:
         node = waiting.pop()
@@ -102,7 +106,13 @@ def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[No
                 waiting += [*loop.carries, *loop.conditions, *loop.results[: len(loop.carries)]]
             if node.op == "project":
                 waiting += [loop.results[node.attribute] for loop in _bodies(program, node.args[0])]
-    nodes = sorted(reached, key=lambda node: node.number)
+    return sorted(reached, key=lambda node: node.number)
+
+
+def _readers(
+    program: Program, results: list[Node], nodes: list[Node]
+) -> tuple[dict[Node, list[Node]], set[Node], set[Node]]:
+    """Returns the readers of every node, the nodes read whole, and those read by pointer."""
     readers: dict[Node, list[Node]] = {node: [] for node in nodes}
     whole, contiguous = {node for node in results if node.size > UNROLL_LIMIT}, set()
     for node in nodes:
@@ -112,7 +122,7 @@ def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[No
             contiguous |= set(node.args[:1] if node.op == "take" else node.args)
         for loop in _bodies(program, node):
             whole |= {*loop.results, *loop.conditions, *node.args}
-    return nodes, readers, whole, contiguous
+    return readers, whole, contiguous
 
 
 def _is_unrolled(node: Node) -> bool:
