@@ -46,10 +46,8 @@ class Source:
     loop_bound: int | None = None
     """A loop without a known bound ends with NaN after this number of iterations."""
     tables: dict[tuple[str, bytes], tuple[str, np.ndarray]] = field(default_factory=dict)
-    parts: dict[bytes, "Called"] = field(default_factory=dict)
+    parts: dict[Any, "Called"] = field(default_factory=dict)
     """Functions that others call, by the key of their program."""
-    names: dict[str, str] = field(default_factory=dict)
-    """Names of these functions, by their text."""
 
     @property
     def suffix(self) -> str:

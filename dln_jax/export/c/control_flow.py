@@ -84,7 +84,9 @@ def _while(
             return after
         ranks = [len(new.shape) - len(holds.shape) for new in after]
         every = [program.reshape(holds, (*holds.shape, *[1] * rank)) for rank in ranks]
-        return [program.select(row, old, new) for row, old, new in zip(every, inside, after, strict=True)]
+        return [
+            program.elementwise("select", row, new, old) for row, old, new in zip(every, inside, after, strict=True)
+        ]
 
     inside, results, steady = _steady(program, start, carries, turn)
     holds = condition(inside)

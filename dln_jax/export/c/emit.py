@@ -117,10 +117,8 @@ def _part(source: Source, program: Program, results: list[Node]) -> Called:
     unused = [f"    (void)a{k}_;" for k in sorted(inputs) if inputs[k] not in body.plan.nodes]
     unused += [f"    (void){target};" for result, target in zip(results, targets, strict=True) if not result.size]
     lines = "\n".join([*unused, *body.lines])
-    text = f"({', '.join(parameters)})\n{{\n{lines}\n}}\n"
-    name = source.names.setdefault(text, f"part_{len(source.names)}")
-    written = f"\nstatic void {name}{text}"
-    return Called(name, results, written, body)
+    name = f"part_{len(source.parts)}"
+    return Called(name, results, f"\nstatic void {name}({', '.join(parameters)})\n{{\n{lines}\n}}\n", body)
 
 
 def _stored(body: Body, node: Node, results: Sequence[Node], turns: int = 1) -> list[str]:

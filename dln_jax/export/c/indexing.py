@@ -26,13 +26,15 @@ def _gather(
         program, indices, operand.shape, slice_sizes, mode, numbers.start_index_map,
         dropped=(*numbers.collapsed_slice_dims, *numbers.operand_batching_dims),
         batched=(numbers.operand_batching_dims, numbers.start_indices_batching_dims),
-        order=np.argsort([*outer, *numbers.offset_dims]),
     )  # fmt: skip
     if fill_value is None:  # JAX's default
         fill_value = (
             np.nan if operand.dtype == "real" else limit(operand.dtype, upper=operand.dtype in ("bool", *UNSIGNED))
         )
-    return program.select(inside, program.constant(fill_value, operand.dtype), take(program, operand, positions))
+    taken = take(program, operand, positions)
+    result = program.elementwise("select", inside, taken, program.constant(fill_value, operand.dtype))
+    order = np.argsort([*outer, *numbers.offset_dims])
+    return program.gather([result], np.arange(result.size).reshape(result.shape).transpose(order))
 
 
 def _scatter(op: str) -> Rule:
@@ -50,19 +52,19 @@ def _scatter(op: str) -> Rule:
             program, indices, operand.shape, sizes, mode, numbers.scatter_dims_to_operand_dims,
             dropped=dropped, batched=(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims),
         )  # fmt: skip
-        targets = program.select(inside, program.constant(-1, "index"), targets)
+        targets = program.elementwise("select", inside, targets, program.constant(-1, "index"))
         outer = [axis for axis in range(len(updates.shape)) if axis not in numbers.update_window_dims]
         order = np.arange(updates.size).reshape(updates.shape).transpose([*outer, *numbers.update_window_dims])
         updates = program.gather([updates], order)
         if op == "set" and update_jaxpr is not None:  # of `x.at[i].apply(f)`
-            return _updated(program, update_jaxpr, update_consts, operand, targets, updates)
+            return _updated(program, core.ClosedJaxpr(update_jaxpr, update_consts), operand, targets, updates)
         return _put(program, op, operand, targets, updates)
 
     return rule
 
 
 def _windows(
-    program: Program, indices: Node, shape, sizes, mode: Any, axes, *, dropped=(), batched=((), ()), order=None
+    program: Program, indices: Node, shape, sizes, mode: Any, axes, *, dropped=(), batched=((), ())
 ) -> tuple[Node, Node]:
     """Returns the flat positions of windows, clamped into the operand, and which to keep if those outside are dropped.
 
@@ -75,7 +77,6 @@ def _windows(
         axes: axes of the operand that the indices refer to.
         dropped: axes of the operand that a window lacks.
         batched: corresponding axes of the operand and of the indices.
-        order: order of the result's axes, among those of the batch followed by those of a window, if it differs.
     """
     batch, fills = indices.shape[:-1], "FILL" in str(mode).upper()
     index, steps = np.arange(indices.size).reshape(indices.shape), [prod(shape[k + 1 :]) for k in range(len(shape))]
@@ -94,16 +95,10 @@ def _windows(
         clamped = program.elementwise("min", program.elementwise("max", start, 0), last)
         corners = program.elementwise("add", corners, program.elementwise("mul", clamped, steps[axis]))
     offsets = np.arange(prod(shape)).reshape(shape)[tuple(map(slice, sizes))].squeeze(tuple(dropped))
-    windows = np.arange(prod(batch)).reshape((*batch, *[1] * offsets.ndim))
-
-    def placed(array: np.ndarray) -> np.ndarray:
-        whole = np.broadcast_to(array, (*batch, *offsets.shape))
-        return whole if order is None else whole.transpose(order)
-
-    positions = program.elementwise(
-        "add", program.gather([corners], placed(windows)), program.constant(placed(offsets), "index")
-    )
-    return positions, program.gather([inside], placed(windows))
+    shape = (*batch, *offsets.shape)
+    windows = np.broadcast_to(np.arange(prod(batch)).reshape((*batch, *[1] * offsets.ndim)), shape)
+    within = program.constant(np.broadcast_to(offsets, shape), "index")
+    return program.elementwise("add", program.gather([corners], windows), within), program.gather([inside], windows)
 
 
 def take(program: Program, operand: Node, positions: Node) -> Node:
@@ -120,30 +115,27 @@ def _put(program: Program, op: str, operand: Node, targets: Node, updates: Node)
     """Returns the operand with updates set at, or combined with, flat targets; negative targets are dropped."""
     if not is_constant(targets):
         return program.make(f"put_{op}", operand.shape, operand.dtype, [operand, targets, updates])
-    flat, index = values(targets).ravel(), np.arange(operand.size)
+    flat = values(targets).ravel()
     left = np.flatnonzero(flat >= 0)
-    if op == "set":
-        index[flat[left]] = operand.size + left
-        return program.gather([operand, updates], index.reshape(operand.shape))
     while left.size:  # a pass handles one update per target
         _, first = np.unique(flat[left], return_index=True)
         now = left[first]
-        combined = program.elementwise(op, program.gather([operand], flat[now]), program.gather([updates], now))
+        new = program.gather([updates], now)
+        if op != "set":
+            new = program.elementwise(op, program.gather([operand], flat[now]), new)
         index = np.arange(operand.size)
         index[flat[now]] = operand.size + np.arange(now.size)
-        operand = program.gather([operand, combined], index.reshape(operand.shape))
+        operand = program.gather([operand, new], index.reshape(operand.shape))
         left = np.delete(left, first)
     return operand
 
 
-def _updated(program: Program, jaxpr: Any, constants, operand: Node, targets: Node, updates: Node) -> Node:
-    """Returns the operand after `jaxpr` of an element and an update, at one target after the other."""
-    closed = core.ClosedJaxpr(jaxpr, constants)
-    for place in range(targets.size):
-        target, update = (program.gather([node], np.array([place])) for node in (targets, updates))
+def _updated(program: Program, closed: Any, operand: Node, targets: Node, updates: Node) -> Node:
+    """Returns the operand after a jaxpr of an element and an update, at one target after the other."""
+    for target, update in zip(program.scalars(targets), program.scalars(updates), strict=True):
         old = take(program, operand, program.elementwise("max", target, 0))
-        (new,) = program.inline(program, closed, [program.one(old), program.one(update)])
-        operand = _put(program, "set", operand, target, program.reshape(new, (1,)))
+        (new,) = program.inline(program, closed, [old, update])
+        operand = _put(program, "set", operand, target, new)
     return operand
 
 

@@ -159,7 +159,13 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
             program, lambda *leaves: jax.tree.leaves(high.expand(*jax.tree.unflatten(high.in_tree, leaves))), args
         )
     if _is_error_of_equinox(equation):
-        return [_failed(program, variable.aval) for variable in equation.outvars]
+        # C cannot raise an error: the results are NaN, the largest integers or true.
+        kinds = [kind_of(variable.aval.dtype) for variable in equation.outvars]
+        missing = [program.constant(failure(kind), kind) for kind in kinds]
+        return [
+            program.broadcast(node, variable.aval.shape)
+            for node, variable in zip(missing, equation.outvars, strict=True)
+        ]
     if name in _RULES or name in OPERATIONS:
         return _ruled(program, equation, args)
     if why := next((reason for part, reason in _REFUSED.items() if part in name), None):
@@ -191,12 +197,6 @@ def _ruled(program: Program, equation: Any, args: list[Node]) -> list[Node]:
     known = {**equation.params, "results": results, "kind": kind_of(results[0].dtype) if results else None}
     nodes = rule(program, *args, **{key: known[key] for key in read if key in known})
     return list(nodes) if isinstance(nodes, list | tuple) else [nodes]
-
-
-def _failed(program: Program, aval: Any) -> Node:
-    """Returns the value that stands for an error, which C cannot raise: NaN, the largest integer or true."""
-    kind = kind_of(aval.dtype)
-    return program.broadcast(program.constant(failure(kind), kind), aval.shape)
 
 
 def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:

@@ -121,6 +121,11 @@ def owners(sources: Sequence[Node], positions: np.ndarray) -> tuple[np.ndarray, 
     return np.searchsorted(starts, positions, side="right") - 1, starts
 
 
+def sources_of(node: Node) -> tuple[Sequence[Node], np.ndarray]:
+    """Returns the nodes that a node takes its elements from, laid end to end, and the elements' positions [size]."""
+    return (node.args, np.ravel(node.value)) if node.op == "gather" else ((node,), np.arange(node.size))
+
+
 def read_source(node: Node, positions: np.ndarray) -> tuple[Node, np.ndarray]:
     """Returns the single source that a `gather` reads at these positions, and the positions in it."""
     positions = np.asarray(np.asarray(node.value).ravel()[positions])

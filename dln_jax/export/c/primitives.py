@@ -125,10 +125,10 @@ def _sign(x):
 
 def _select_n(program: Program, which: Node, *cases: Node) -> Node:
     if which.dtype == "bool":
-        return program.select(which, *cases)
+        return program.elementwise("select", which, *reversed(cases))
     result = cases[-1]
     for number, case in reversed(list(enumerate(cases[:-1]))):
-        result = program.select(program.elementwise("eq", which, number), result, case)
+        result = program.elementwise("select", program.elementwise("eq", which, number), case, result)
     return result
 
 

@@ -40,6 +40,7 @@ from dln_jax.export.c.nodes import (
     is_constant,
     is_uniform,
     owners,
+    sources_of,
     unrolls,
     unrolls_product,
     values,
@@ -108,8 +109,7 @@ class Program:
         """Returns the elements at `positions` [shape] of the sources laid end to end."""
         inner, flat, start = [], [], 0
         for source in sources:
-            parts = source.args if source.op == "gather" else (source,)
-            within = np.arange(source.size) if source.value is None or source.op == "const" else source.value.ravel()
+            parts, within = sources_of(source)
             inner += parts
             flat.append(within + start)
             start += sum(part.size for part in parts)
@@ -151,9 +151,8 @@ class Program:
             with np.errstate(all="ignore"):
                 value = operation.fold(*map(values, args))
             return self.constant(np.broadcast_to(value, shape), dtype)
-        for other in (self._simpler, self._below_broadcast):
-            if (equal := other(op, args, shape)) is not None:
-                return equal
+        if equal := self._simpler(op, args, shape) or self._below_broadcast(op, args, shape):
+            return equal
         if unrolls(op, args, shape, finite=self.finite):
             columns = [self.scalars(arg) * (prod(shape) if arg.shape == () else 1) for arg in args]
             elements = [self.elementwise(op, *row) for row in zip(*columns, strict=True)]
@@ -168,6 +167,10 @@ class Program:
         for kept, other in ((a, b), (b, a))[: 2 if op in (*COMMUTATIVE, "max", "min") else 1]:
             if (number := neutral(op, a.dtype)) is not None and is_all(other, number):
                 return self.broadcast(kept, shape)
+        if op == "select" and is_constant(a):
+            index = np.arange(prod(shape)).reshape(shape)
+            both = [self.broadcast(case, shape) for case in (b, args[1])]
+            return self.gather(both, np.where(values(a), index + index.size, index))
         if op in ("add", "sub") and b.op == "neg":
             return self.elementwise("sub" if op == "add" else "add", a, b.args[0])
         if op == "add" and a.op == "neg":
@@ -219,8 +222,8 @@ class Program:
     def dot_general(self, a: Node, b: Node) -> Node:
         """Returns sum_k a[b, m, k] b[b, k, n]; products with a constant are transposed so that it comes second."""
         (batch, m, k), n = a.shape, b.shape[2]
-        if a.op == b.op == "const" and a.value is not None and b.value is not None:
-            return self.constant(np.matmul(a.value, b.value), a.dtype)
+        if a.op == b.op == "const":
+            return self.constant(np.matmul(values(a), values(b)), a.dtype)
         if k == 0:
             return self.constant(np.zeros((batch, m, n)), a.dtype)
         if k == 1:
@@ -244,14 +247,10 @@ class Program:
         """Returns the elements of a node as scalars."""
         key = node, self.floor
         if key not in self._scalars:
-            if node.op == "gather":
-                owner, starts = owners(node.args, np.asarray(node.value).ravel())
-                places = np.asarray(node.value).ravel() - starts[owner]
-                self._scalars[key] = [
-                    self._element(node.args[k], place) for k, place in zip(owner, places, strict=True)
-                ]
-            else:
-                self._scalars[key] = [self._element(node, np.int64(place)) for place in range(node.size)]
+            parts, positions = sources_of(node)
+            owner, starts = owners(parts, positions)
+            places = positions - starts[owner]
+            self._scalars[key] = [self._element(parts[k], place) for k, place in zip(owner, places, strict=True)]
         return self._scalars[key]
 
     def _element(self, node: Node, place: np.int64) -> Node:
@@ -266,13 +265,3 @@ class Program:
     def transpose(self, node: Node) -> Node:
         """Returns the node with its last two axes exchanged."""
         return self.gather([node], np.swapaxes(np.arange(node.size).reshape(node.shape), -1, -2))
-
-    def select(self, chosen: Node, if_false: Node, if_true: Node) -> Node:
-        """Returns an elementwise selection; with a constant condition it is a gather."""
-        shape = np.broadcast_shapes(chosen.shape, if_false.shape, if_true.shape)
-        if is_constant(chosen):
-            chosen_value = np.broadcast_to(values(chosen), shape)
-            both = [self.broadcast(case, shape) for case in (if_false, if_true)]
-            index = np.arange(chosen_value.size).reshape(shape)
-            return self.gather(both, np.where(chosen_value, index + chosen_value.size, index))
-        return self.elementwise("select", chosen, if_true, if_false)

@@ -124,7 +124,7 @@ def source_files(
         )
         version = importlib.metadata.version("dln-jax")
         written_by = f"Written by dln-jax {version}, C format {FORMAT}."
-        text = "".join([*dict.fromkeys(part.text for part in source.parts.values()), *texts])
+        text = "".join([*(part.text for part in source.parts.values()), *texts])
         files = {
             f"{name}.h": header(name, written_by, signatures, precision, left_out),
             f"{name}.c": comment(f"{name}.c", written_by, NEEDED) + preamble(source, name, text) + text,

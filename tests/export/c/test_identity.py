@@ -59,12 +59,6 @@ def test_models_in_one_export_keep_their_own_weights(tmp_path):
         np.testing.assert_allclose(getattr(loaded, name)(STATE), function(STATE), rtol=1e-12)
 
 
-def test_functions_of_equal_programs_are_one_however_they_came_about():
-    alike, differing = of_two(model(W), model(W.copy())), of_two(model(W), model(np.nextafter(W, 1)))
-    assert parts(source_files({"f": (alike, (STATE,))}, name="model")) == 1
-    assert parts(source_files({"f": (differing, (STATE,))}, name="model")) == 2
-
-
 def test_what_is_called_counts_with_what_calls_it():
     """Functions that call another, or one that calls it, need its stack; each is written once."""
     inner = model(W)
