@@ -70,21 +70,23 @@ def looped(body: Body, node: Node) -> None:
     inside = sorted(
         {node, *(member for member, root in body.plan.root.items() if root is node)}, key=lambda member: member.number
     )
-    where: dict[Node, np.ndarray] = {}
+    where: dict[Node, tuple[Node, np.ndarray]] = {}
     index = np.arange(node.size).reshape(node.shape)
     for member in inside:
         for arg in member.args[1:] if member.op == "take" else member.args:
             if arg not in inside:
-                where[arg] = index if arg.size == node.size else np.zeros_like(index)
+                positions = index if arg.size == node.size else np.zeros_like(index)
+                moved = arg.op == "gather" and arg not in body.plan.arrays
+                where[arg] = read_source(arg, positions) if moved else (arg, positions)
     target = body.kept(node)
     if node.op in VECTORISED and not body.source.libm:
         body.spend(**{node.op: node.size})
         body.line(f"elementary_{node.op}_each({node.size}, {body.name(node.args[0])}, {target});")
         return
-    shape = _merged(node.shape, [_steps(body, arg, positions) for arg, positions in where.items()])
+    shape = _merged(node.shape, [steps(positions) for _, positions in where.values()])
     names = _variables(shape)
     with body.loops(dict(zip(names, shape, strict=True))):
-        text = {arg: body.read(arg, positions.reshape(shape), names) for arg, positions in where.items()}
+        text = {arg: body.read(source, at.reshape(shape), names) for arg, (source, at) in where.items()}
         for member in inside:
             if member.op == "take":
                 written = f"{body.name(member.args[0])}[{text[member.args[1]]}]"
@@ -103,19 +105,12 @@ def _variables(shape: Sequence[int]) -> list[str]:
     return [f"i{axis}_" for axis in range(len(shape))]
 
 
-def _steps(body: Body, node: Node, positions: np.ndarray) -> list[int | None]:
-    """Returns the steps of a read along each axis, with None where it needs a table."""
-    if node.op == "gather" and node not in body.plan.arrays:
-        positions = np.asarray(np.asarray(node.value).ravel()[positions])
-    return steps(positions)
-
-
 def _merged(shape: Sequence[int], steps: list[list[int | None]]) -> list[int]:
     """Returns the shape with adjacent axes merged where all reads allow it; at least one axis remains."""
     result: list[int] = []
     kept: list[int] = []
     for axis, extent in enumerate(shape):
-        if extent == 1 and len(shape) > 1 and (result or axis + 1 < len(shape)):
+        if extent == 1:
             continue
         if kept and all(None not in step and step[kept[-1]] == (step[axis] or 0) * extent for step in steps):
             result[-1] *= extent

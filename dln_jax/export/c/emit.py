@@ -127,16 +127,15 @@ def _stored(body: Body, node: Node, results: Sequence[Node], turns: int = 1) -> 
     A loop has its carries, initialised with its arguments, then the outputs of all `turns` iterations.
     """
     number = np.ravel(node.attribute)[0]
-    carried = len(node.args) if node.op != "branch" else len(results)
+    starts = () if node.op == "branch" else node.args
     names = [f"c{number}_{index}" for index in range(len(results))]
     for index, (name, result) in enumerate(zip(names, results, strict=True)):
-        body.declared(name, result.dtype, max(result.size * (turns if index >= carried else 1), 1))
+        body.declared(name, result.dtype, max(result.size * (turns if index >= len(starts) else 1), 1))
     read = body.projected(node)
     for name in (name for index, name in enumerate(names) if index not in read):
         body.line(f"(void){name};")
-    if node.op != "branch":
-        for name, start in zip(names[:carried], node.args, strict=True):
-            copied(body, start, name)
+    for name, start in zip(names, starts, strict=False):
+        copied(body, start, name)
     return names
 
 
@@ -181,13 +180,12 @@ def _while(body: Body, node: Node) -> None:
 def _bound(node: Node, loop: Loop) -> int | None:
     """Returns the largest number of iterations of a `while` whose condition compares a counter, or None."""
     waiting, bounds = [*loop.conditions], []
-    while waiting:
-        test = waiting.pop()
+    for test in waiting:
         if test.op == "and" and test.dtype == "bool":
             waiting += test.args
         elif test.op in ("lt", "le", "gt", "ge"):
             counter, last = test.args if test.op in ("lt", "le") else test.args[::-1]
-            if counter.op == "carry" and counter in loop.carries and is_constant(last) and counter.dtype != "real":
+            if counter in loop.carries and is_constant(last) and counter.dtype != "real":
                 place = loop.carries.index(counter)
                 start, after = node.args[place], loop.results[place]
                 steps = [arg for arg in after.args if arg is not counter] if after.op == "add" else []

@@ -140,15 +140,15 @@ def _dots(body: Body, node: Node) -> None:
     batch, m, count = a.shape
     body.spend(multiply_add=batch * m * count)
     parts = 2 * _LANES[body.source.precision]
-    i, j, k = np.meshgrid(np.arange(batch), np.arange(m), np.arange(count), indexing="ij")
+    of_a, of_b, of_result = (np.arange(one.size).reshape(one.shape) for one in (a, b, node))
 
     def add(index: str, total: str) -> str:
-        first = body.read(a, (i * m + j) * count + k, ["b_", "r_", index])
-        return f"MULTIPLY_ADD({first}, {body.read(b, (i * count + k)[:, 0], ['b_', index])}, {total})"
+        first, second = body.read(a, of_a, ["b_", "r_", index]), body.read(b, of_b[..., 0], ["b_", index])
+        return f"MULTIPLY_ADD({first}, {second}, {total})"
 
     with body.loops({"b_": batch, "r_": m}):
         summed(body, count, parts, add)
-        body.line(f"{body.name(node)}[{body.index((i * m + j)[..., 0], ['b_', 'r_'])}] = sum_;")
+        body.line(f"{body.name(node)}[{body.index(of_result[..., 0], ['b_', 'r_'])}] = sum_;")
 
 
 def summed(body: Body, count: int, parts: int, add: Callable[[str, str], str]) -> None:

@@ -201,20 +201,15 @@ def _ruled(program: Program, equation: Any, args: list[Node]) -> list[Node]:
 
 def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
     """Returns the results of a call; constant arguments become part of the called function."""
-    fixed = {k: arg for k, arg in enumerate(args) if is_constant(arg)}
-    call = id(closed), tuple((k, values(arg).tobytes()) for k, arg in fixed.items())
+    call = id(closed), tuple((k, values(arg).tobytes()) for k, arg in enumerate(args) if is_constant(arg))
+    passed = [arg for arg in args if not is_constant(arg)]
     if call not in program.parts:
         part = replace(program, nodes=[], loops={}, floor=(), _interned={}, _scalars={})
-        inside = [
-            part.constant(values(arg), arg.dtype)
-            if k in fixed
-            else part.make("input", arg.shape, arg.dtype, attribute=k - sum(place < k for place in fixed))
-            for k, arg in enumerate(args)
-        ]
+        inputs = iter([part.make("input", arg.shape, arg.dtype, attribute=k) for k, arg in enumerate(passed)])
+        inside = [part.constant(values(arg), arg.dtype) if is_constant(arg) else next(inputs) for arg in args]
         program.parts[call] = part, _inline(part, closed, inside)
-    shapes = [(result.shape, result.dtype) for result in program.parts[call][1]]
-    passed = [arg for k, arg in enumerate(args) if k not in fixed]
-    return control_flow.projections(program, program.make("call", (), "int", passed, attribute=call), shapes)
+    made = program.make("call", (), "int", passed, attribute=call)
+    return control_flow.projections(program, made, _closed(closed).out_avals)
 
 
 def _custom_linear_solve(program: Program, *args: Node, const_lengths: Any, jaxprs: Any) -> list[Node]:

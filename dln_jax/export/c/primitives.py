@@ -57,9 +57,7 @@ def _moved(move: Callable[..., Any]) -> Rule:
         starts = np.cumsum([0, *(node.size for node in nodes)])
         indices = [np.arange(node.size).reshape(node.shape) + k for node, k in zip(nodes, starts, strict=False)]
         moved = move(*indices, **parameters)
-        if isinstance(moved, list):
-            return [program.gather(nodes, positions) for positions in moved]
-        return program.gather(nodes, moved)
+        return [program.gather(nodes, positions) for positions in (moved if isinstance(moved, list) else [moved])]
 
     return rule
 
@@ -126,8 +124,8 @@ def _sign(x):
 def _select_n(program: Program, which: Node, *cases: Node) -> Node:
     if which.dtype == "bool":
         return program.elementwise("select", which, *reversed(cases))
-    result = cases[-1]
-    for number, case in reversed(list(enumerate(cases[:-1]))):
+    *others, result = cases
+    for number, case in enumerate(others):
         result = program.elementwise("select", program.elementwise("eq", which, number), case, result)
     return result
 

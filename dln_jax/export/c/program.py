@@ -33,6 +33,7 @@ from typing import Any
 import numpy as np
 
 from dln_jax.export.c.nodes import (
+    UNROLL_LIMIT,
     Loop,
     Node,
     Region,
@@ -118,9 +119,8 @@ class Program:
         if not inner or positions.size == 0:
             return self.constant(np.zeros(positions.shape), sources[0].dtype)
         if all(source.op == "const" for source in inner):
-            total = sum(source.size for source in inner)
-            if positions.size <= max(total, 64):
-                joined = np.concatenate([source.value.ravel() for source in inner if source.value is not None])
+            joined = np.concatenate([values(source).ravel() for source in inner])
+            if positions.size <= max(joined.size, UNROLL_LIMIT):
                 return self.constant(joined[positions], inner[0].dtype)
         alone = len(inner) == 1 and inner[0].shape == positions.shape
         if alone and np.array_equal(positions.ravel(), np.arange(positions.size)):
@@ -177,8 +177,6 @@ class Program:
             return self.elementwise("sub", b, a.args[0])
         if op == "neg" and a.op == "neg":
             return a.args[0]
-        if op == "abs" and a.op in ("neg", "abs"):
-            return self.elementwise("abs", a.args[0])
         if (op in ("max", "min") and a is b) or (op == "select" and args[1] is b):
             return self.broadcast(b, shape)
         if op == "multiply_add":
@@ -204,19 +202,16 @@ class Program:
     def _below_broadcast(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
         """Returns the operation applied before a common broadcast of its arguments, or None if they share none."""
         repeated = [arg for arg in args if arg.size > 1 and not is_uniform(arg)]
-        others = [arg for arg in args if arg.size == 1 or is_uniform(arg)]
-        if not shape or any(arg.op == "const" for arg in repeated) or len(repeated) + len(others) < len(args):
+        if prod(shape) <= 1 or any(arg.op != "gather" or len(arg.args) > 1 for arg in repeated):
             return None
         if not repeated:
-            if prod(shape) <= 1:
-                return None
             return self.broadcast(self.elementwise(op, *map(self.one, args)), shape)
-        positions, source = np.asarray(repeated[0].value), repeated[0].args[:1]
+        positions, source = np.asarray(repeated[0].value), repeated[0].args[0]
         for arg in repeated:
-            alike = arg.op == "gather" and len(arg.args) == 1 and arg.args[0].shape == source[0].shape
-            if not alike or arg.args[0].size >= arg.size or not np.array_equal(np.asarray(arg.value), positions):
+            alike = arg.args[0].shape == source.shape and np.array_equal(np.asarray(arg.value), positions)
+            if not alike or source.size >= arg.size:
                 return None
-        below = [arg.args[0] if any(arg is one for one in repeated) else self.one(arg) for arg in args]
+        below = [arg.args[0] if arg in repeated else self.one(arg) for arg in args]
         return self.gather([self.elementwise(op, *below)], positions)
 
     def dot_general(self, a: Node, b: Node) -> Node:
