@@ -131,18 +131,15 @@ class Body:
         """Declares an array, or a scalar if size is 0; a scalar with a value is constant."""
         width = 4 if self.source.precision == "f32" and dtype == "real" else 8
         self.stack += -(-size * width // _ALIGNMENT) * _ALIGNMENT or width
-        array, start, constant = (
-            f"[{size}]" * bool(size),
-            f" = {value}" * bool(value),
-            "const " * bool(value and not size),
-        )
-        self.line(f"{constant}{C_TYPES[dtype]} {name}{array}{start};")
+        declaration = f"{C_TYPES[dtype]} {name}" + f"[{size}]" * bool(size) + f" = {value}" * bool(value)
+        self.line("const " * bool(value and not size) + declaration + ";")
 
     def kept(self, node: Node) -> str:
         """Returns the name of an array for a node, reusing a free one if possible."""
-        free = self._free.get((node.region, node.dtype, node.size))
-        self.names[node] = free.pop() if free else f"v{node.number}"
-        if self.names[node] == f"v{node.number}":
+        if free := self._free.get((node.region, node.dtype, node.size)):
+            self.names[node] = free.pop()
+        else:
+            self.names[node] = f"v{node.number}"
             self.declared(self.names[node], node.dtype, node.size)
         return self.names[node]
 

@@ -82,10 +82,6 @@ def _pad(index, padding, *, padding_config):
     return index
 
 
-def _split(index, *, sizes, axis):
-    return list(np.split(index, np.cumsum(sizes)[:-1], axis=axis))
-
-
 def _power(program: Program, x: Node, exponent: Node, *, kind: str) -> Node:
     return program.elementwise("pow", *(convert(program, node, kind) for node in (x, exponent)))
 
@@ -142,10 +138,6 @@ def _bits(program: Program, x: Node, *, results: Any, kind: str) -> Node:
 
 def _empty(program: Program, *, kind: str, shape: tuple[int, ...] = ()) -> Node:
     return program.constant(np.zeros(shape), kind)
-
-
-def _iota(program: Program, *, shape, dimension: int, kind: str) -> Node:
-    return program.constant(np.indices(shape)[dimension], kind)
 
 
 def _reduce_precision(program: Program, x: Node, *, exponent_bits: int, mantissa_bits: int) -> Node:
@@ -254,10 +246,6 @@ def _geqrf(program: Program, a: Node) -> list[Node]:
     return _applied(program, "geqrf", a, shapes=[a.shape[-2:], (min(a.shape[-2:]),)])
 
 
-def _householder_product(program: Program, a: Node, tau: Node) -> list[Node]:
-    return _applied(program, "householder_product", a, tau, shapes=[a.shape[-2:]], ranks=(2, 1))
-
-
 def _with_columns(a, count):
     """Returns matrices with columns of zeros appended up to a count."""
     return jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, max(count - a.shape[-1], 0))])
@@ -307,7 +295,7 @@ RULES: dict[str, Rule] = {
     "round": lambda program, x, *, rounding_method: program.elementwise("rint" if int(rounding_method) else "round", x),
     "select_n": _select_n,
     "convert_element_type": lambda program, x, *, kind: convert(program, x, kind),
-    "iota": _iota,
+    "iota": lambda program, *, shape, dimension, kind: program.constant(np.indices(shape)[dimension], kind),
     "empty": _empty,
     "empty2": _empty,
     "bitcast_convert_type": _bits,
@@ -322,7 +310,7 @@ RULES: dict[str, Rule] = {
     "concatenate": _moved(lambda *indices, dimension: np.concatenate(indices, axis=dimension)),
     "stack": _moved(lambda *indices, axis: np.stack(indices, axis)),
     "unstack": _moved(lambda index, *, axis: list(np.moveaxis(index, axis, 0))),
-    "split": _moved(_split),
+    "split": _moved(lambda index, *, sizes, axis: list(np.split(index, np.cumsum(sizes)[:-1], axis=axis))),
     "dot_general": _dot_general,
     **{f"reduce_{name}": _reduction(op) for name, op in _OF_REDUCTIONS.items()},
     "argmax": _place_of(jnp.max),
@@ -332,7 +320,9 @@ RULES: dict[str, Rule] = {
     "cummax": _cumulative(jnp.maximum),
     "cummin": _cumulative(jnp.minimum),
     "geqrf": _geqrf,
-    "householder_product": _householder_product,
+    "householder_product": lambda program, a, tau: _applied(
+        program, "householder_product", a, tau, shapes=[a.shape[-2:]], ranks=(2, 1)
+    ),
     "ormqr": _composed(_ormqr),
     "qr": _qr,
     "eigh": _eigh,
