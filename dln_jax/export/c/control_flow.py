@@ -108,8 +108,8 @@ def _scan(program: Program, *args: Node, length: int, jaxpr: Any, reverse: bool,
     constants = alike(args, inner.invars) - count
     fixed, start, stacked = args[:constants], args[constants : constants + count], args[constants + count :]
     if length == 0:
-        left = results[count:]
-        return [*start, *(program.constant(np.zeros(aval.shape), kind_of(aval.dtype)) for aval in left)]
+        empty = [program.constant(np.zeros(aval.shape), kind_of(aval.dtype)) for aval in results[count:]]
+        return [*start, *empty]
     region, carries = _opened(program, args, start)
     turn = program.make("counter", (), "index", attribute=region[-1], region=region)
     slices = [_slice_of(program, array, turn, length) for array in stacked]

@@ -71,8 +71,8 @@ def repeated_calls(every: Sequence[Any]) -> set[int]:
         if id(jaxpr) not in sizes:
             total = 0
             for equation in _closed(jaxpr).jaxpr.eqns:
-                values = equation.params.values() if _of_jax(equation.primitive) else ()
-                inside = [inner for value in values for inner in _jaxprs(value)]
+                leaves = jax.tree.leaves(equation.params) if _of_jax(equation.primitive) else []
+                inside = [leaf for leaf in leaves if hasattr(leaf, "eqns") or hasattr(leaf, "jaxpr")]
                 counts.update(map(id, inside))
                 total += max(1, sum(map(size, inside)))
             sizes[id(jaxpr)] = total
@@ -81,12 +81,6 @@ def repeated_calls(every: Sequence[Any]) -> set[int]:
     for closed in every:
         size(closed)
     return {identity for identity, count in counts.items() if count > 1 and sizes[identity] >= _LARGE_CALL}
-
-
-def _jaxprs(value: Any) -> list[Any]:
-    if isinstance(value, list | tuple):
-        return [jaxpr for item in value for jaxpr in _jaxprs(item)]
-    return [value] if hasattr(value, "eqns") or hasattr(value, "jaxpr") else []
 
 
 def program_of(
