@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dln_jax.export.c.interface import Cost
-from dln_jax.export.c.nodes import Node, Region, is_constant, read_source, strides, values
+from dln_jax.export.c.nodes import Node, Region, is_constant, read_source, steps, values
 from dln_jax.export.c.operations import OPERATIONS, total
 from dln_jax.export.c.plan import Plan
 from dln_jax.export.c.program import Program
@@ -32,11 +32,7 @@ class Called(NamedTuple):
     name: str
     results: list[Node]
     text: str
-    operations: Counter[str]
-    unbounded: int
-    stack: int
-    calls: set[Any]
-    """Keys (in the source) of the functions that it calls, directly or indirectly."""
+    body: "Body"
 
 
 @dataclass
@@ -50,19 +46,8 @@ class Source:
     loop_bound: int | None = None
     """A loop without a known bound ends with NaN after this number of iterations."""
     tables: dict[tuple[str, bytes], tuple[str, np.ndarray]] = field(default_factory=dict)
-    functions: set[str] = field(default_factory=set)
-    """Elementary functions called on scalars."""
-    arrays: set[str] = field(default_factory=set)
-    """Elementary functions called on arrays."""
-    integers: set[str] = field(default_factory=set)
-    """Integer functions called."""
-    kernels: set[str] = field(default_factory=set)
-    orders: set[tuple[str, ...]] = field(default_factory=set)
-    """Kinds of the keys of every sort."""
-    parts: dict[bytes, "Called"] = field(default_factory=dict)
+    parts: dict[Any, "Called"] = field(default_factory=dict)
     """Functions that others call, by the key of their program."""
-    names: dict[str, str] = field(default_factory=dict)
-    """Names of these functions, by their text."""
 
     @property
     def suffix(self) -> str:
@@ -102,6 +87,8 @@ class Body:
     """Keys (in the source) of the functions that it calls, directly or indirectly."""
     names: dict[Node, str] = field(default_factory=dict)
     """Names of the arrays that hold nodes."""
+    done: set[Node] = field(default_factory=set)
+    """Nodes that are written."""
     _free: dict[tuple[Region, str, int], list[str]] = field(default_factory=dict)
     """Arrays that later lines may reuse, by region, kind and size."""
     _depth: int = 1
@@ -144,27 +131,23 @@ class Body:
         """Declares an array, or a scalar if size is 0; a scalar with a value is constant."""
         width = 4 if self.source.precision == "f32" and dtype == "real" else 8
         self.stack += -(-size * width // _ALIGNMENT) * _ALIGNMENT or width
-        array, start, constant = (
-            f"[{size}]" * bool(size),
-            f" = {value}" * bool(value),
-            "const " * bool(value and not size),
-        )
-        self.line(f"{constant}{C_TYPES[dtype]} {name}{array}{start};")
+        declaration = f"{C_TYPES[dtype]} {name}" + f"[{size}]" * bool(size) + f" = {value}" * bool(value)
+        self.line("const " * bool(value and not size) + declaration + ";")
 
     def kept(self, node: Node) -> str:
         """Returns the name of an array for a node, reusing a free one if possible."""
-        free = self._free.get((node.region, node.dtype, node.size))
-        self.names[node] = free.pop() if free else f"v{node.number}"
-        if self.names[node] == f"v{node.number}":
+        if free := self._free.get((node.region, node.dtype, node.size)):
+            self.names[node] = free.pop()
+        else:
+            self.names[node] = f"v{node.number}"
             self.declared(self.names[node], node.dtype, node.size)
         return self.names[node]
 
     def finished(self, step: Node) -> None:
         """Frees the arrays whose last reader was this step."""
         for source in sorted(self.plan.reads.get(step, ()), key=lambda node: node.number):
-            left = self.plan.readers[source]
-            left.discard(step)
-            if not left and source in self.names:
+            self.plan.readers[source] -= 1
+            if not self.plan.readers[source] and source in self.names:
                 self._free.setdefault((source.region, source.dtype, source.size), []).append(self.names[source])
 
     def name(self, node: Node) -> str:
@@ -197,24 +180,17 @@ class Body:
 
     def index(self, positions: np.ndarray, names: Sequence[str]) -> str:
         """Returns the C expression of an index, using a table unless it is linear in the loop variables."""
-        terms, first = [], 0
-        linear = strides(positions)
-        if linear is None:
-            # The table omits axes along which the index moves by equal steps.
-            even = {axis: step for axis in range(positions.ndim) if (step := _step(positions, axis)) is not None}
-            kept = positions[tuple(0 if axis in even else slice(None) for axis in range(positions.ndim))]
-            table, names_kept = self.source.table(kept.astype(np.int32), "int"), []
-            for axis, name in enumerate(names):
-                if axis in even:
-                    terms += [(even[axis], name)]
-                else:
-                    names_kept.append(name)
-            inside = self.index(np.arange(kept.size).reshape(kept.shape), names_kept)
-            terms.append((1, f"{table}[{inside}]"))
-        else:
-            first, terms = linear[0], list(zip(linear[1], names, strict=True))
-        texts = [f"{stride} * {name}" if stride != 1 else name for stride, name in terms if stride]
-        return " + ".join([*texts, *([str(first)] if first or not texts else [])]).replace("+ -", "- ")
+        every = steps(positions)
+        terms = [f"{step} * {name}" if step != 1 else name for step, name in zip(every, names, strict=True) if step]
+        # The table omits axes along which the index moves by equal steps.
+        first = positions[tuple(slice(None) if step is None else 0 for step in every)]
+        if first.ndim:
+            left = [name for step, name in zip(every, names, strict=True) if step is None]
+            inside = self.index(np.arange(first.size).reshape(first.shape), left)
+            terms.append(f"{self.source.table(first.astype(np.int32), 'int')}[{inside}]")
+        elif first or not terms:
+            terms.append(str(first))
+        return " + ".join(terms).replace("+ -", "- ")
 
     def literal(self, numbers: np.ndarray, dtype: str, names: Sequence[str]) -> str:
         """Returns the C expression of constants, inside loops over these variables."""
@@ -233,11 +209,7 @@ class Body:
 
     def projected(self, loop: Node) -> set[int]:
         """Returns the indices of a loop's results that something reads."""
-        return {
-            node.attribute
-            for node, mask in self.plan.needed.items()
-            if node.op == "project" and node.args[0] is loop and mask.any()
-        }
+        return {node.attribute for node in self.plan.nodes if node.op == "project" and node.args[0] is loop}
 
     @property
     def cost(self) -> Cost:
@@ -248,13 +220,3 @@ class Body:
             total(count), count["add"] + count["sub"] + fused, count["mul"] + fused, count["div"], count["sqrt"],
             functions, self.stack, self.unbounded,
         )  # fmt: skip
-
-    def uses(self, node: Node) -> bool:
-        """Returns whether anything reads a node."""
-        return node in self.plan.needed and bool(self.plan.needed[node].any())
-
-
-def _step(positions: np.ndarray, axis: int) -> int | None:
-    """Returns the common step of all positions along an axis, or None if the steps differ."""
-    steps = np.diff(positions, axis=axis)
-    return None if steps.size and np.ptp(steps) else int(steps.flat[0]) if steps.size else 0

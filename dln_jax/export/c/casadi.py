@@ -32,8 +32,7 @@ from jax import Array, lax
 from dln_jax.export.c.body import Body, Source
 from dln_jax.export.c.emit import body_of
 from dln_jax.export.c.interface import Leaf, argument_leaves, result_leaves
-from dln_jax.export.c.jaxprs import traced
-from dln_jax.export.c.lowering import program_of
+from dln_jax.export.c.lowering import program_of, traced
 from dln_jax.export.c.templates import CASADI_DECLARATIONS, CASADI_FUNCTION, stated
 from dln_jax.types import InputError
 
@@ -239,7 +238,7 @@ def _body(source: Source, inputs: list[Block], outputs: list[Block], way: Callab
     names = {place: (f"in_{k}", False) for place, k in enumerate(dense)}
     targets = [f"res[{j}]" for j, output in enumerate(outputs) if output.dense]
     body = body_of(source, program, results, names, targets, optional=True)
-    used = [k for k, node in zip(dense, arguments, strict=True) if body.uses(node)]
+    used = [k for k, node in zip(dense, arguments, strict=True) if node in body.plan.nodes]
     lines = [f"const casadi_real *in_{k} = arg[{k}] ? arg[{k}] : zeros;" for k in used]
     lines.append("(void)arg; (void)integers; (void)reals; (void)memory;")
     body.lines = [*(f"    {line}" for line in lines), *body.lines, "    return 0;"]

@@ -16,33 +16,33 @@ from dln_jax.export.c.program import Program
 from dln_jax.export.c.text import kind_of
 
 
-def _opened(program: Program, nodes: Sequence[Node], start: Sequence[Node] = ()) -> tuple[Region, int, list[Node]]:
-    """Returns the region around a new loop or branch that reads these nodes, its number, and its carries."""
+def _opened(program: Program, around: Sequence[Node], start: Sequence[Node] = ()) -> tuple[Region, list[Node]]:
+    """Returns the region inside a new loop or branch that reads the nodes around it, and its carries."""
     number = len(program.loops)
     program.loops[number] = Loop([], [], [])
-    outer = max((program.floor, *(node.region for node in nodes)), key=len)
-    return (
-        outer,
-        number,
-        [
-            program.make("carry", carry.shape, carry.dtype, attribute=(number, index), region=(*outer, number))
-            for index, carry in enumerate(start)
-        ],
-    )
+    region = (*max((program.floor, *(node.region for node in around)), key=len), number)
+    return region, [
+        program.make("carry", carry.shape, carry.dtype, attribute=(number, index), region=region)
+        for index, carry in enumerate(start)
+    ]
 
 
-def projections(program: Program, node: Node, shapes: Sequence[tuple[Any, str]]) -> list[Node]:
-    """Returns the results of a loop, a branch or a call."""
-    return [program.make("project", shape, dtype, [node], k) for k, (shape, dtype) in enumerate(shapes)]
+def projections(program: Program, node: Node, results: Sequence[Any]) -> list[Node]:
+    """Returns the results of a loop, a branch or a call, which have these abstract values."""
+    return [program.make("project", aval.shape, kind_of(aval.dtype), [node], k) for k, aval in enumerate(results)]
 
 
-def _with_known(program: Program, node: Node, mask: np.ndarray, numbers: np.ndarray) -> Node:
-    """Returns the node with constants in place of the elements under a mask [size]."""
-    if not mask.any():
-        return node
-    index = np.arange(node.size)
-    both = [node, program.constant(numbers, node.dtype)]
-    return program.gather(both, np.where(mask, index + node.size, index).reshape(node.shape))
+def _with_known(
+    program: Program, nodes: Sequence[Node], constants: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> list[Node]:
+    """Returns the nodes with constants, given by a mask [size] and numbers, in place of the elements under the mask."""
+    results = [*nodes]
+    for place, (node, (mask, numbers)) in enumerate(zip(nodes, constants, strict=True)):
+        if mask.any():
+            index = np.arange(node.size)
+            both = [node, program.constant(numbers, node.dtype)]
+            results[place] = program.gather(both, np.where(mask, index + node.size, index).reshape(node.shape))
+    return results
 
 
 def _steady(
@@ -55,7 +55,7 @@ def _steady(
     steady = [known(node) for node in start]
     steady = [(mask & (program.finite and mask.size > 1), numbers) for mask, numbers in steady]
     while True:
-        inside = [_with_known(program, carry, *one) for carry, one in zip(carries, steady, strict=True)]
+        inside = _with_known(program, carries, steady)
         results = body(inside)
         after = [known(result) for result in results[: len(start)]]
         kept = [
@@ -68,12 +68,13 @@ def _steady(
 
 
 def _while(
-    program: Program, *args: Node, cond_nconsts: int, cond_jaxpr: Any, body_nconsts: int, body_jaxpr: Any
-) -> list[Node]:
+    program: Program, *args: Node, cond_nconsts: int, cond_jaxpr: Any, body_nconsts: int, body_jaxpr: Any,
+    results: Sequence[Any],
+) -> list[Node]:  # fmt: skip
     """Applies `while`; under `vmap` it turns while any row's condition holds, and other rows keep their carries."""
     of_condition, of_body = args[:cond_nconsts], args[cond_nconsts : cond_nconsts + body_nconsts]
     start = args[cond_nconsts + body_nconsts :]
-    outer, number, carries = _opened(program, args, start)
+    region, carries = _opened(program, args, start)
 
     def condition(inside: Sequence[Node]) -> Node:
         return program.inline(program, cond_jaxpr, [*of_condition, *inside])[0]
@@ -82,16 +83,18 @@ def _while(
         after, holds = program.inline(program, body_jaxpr, [*of_body, *inside]), condition(inside)
         if holds.shape == ():
             return after
-        ranks = [len(new.shape) - len(holds.shape) for new in after]
-        every = [program.reshape(holds, (*holds.shape, *[1] * rank)) for rank in ranks]
-        return [program.select(row, old, new) for row, old, new in zip(every, inside, after, strict=True)]
+        added = [[1] * (len(new.shape) - len(holds.shape)) for new in after]
+        every = [program.reshape(holds, (*holds.shape, *ones)) for ones in added]
+        return [
+            program.elementwise("select", row, new, old) for row, old, new in zip(every, inside, after, strict=True)
+        ]
 
-    inside, results, steady = _steady(program, start, carries, turn)
+    inside, after, steady = _steady(program, start, carries, turn)
     holds = condition(inside)
-    program.loops[number] = Loop(carries, [SIMPLE["reduce_or"](program, holds, axes=range(len(holds.shape)))], results)
-    loop = program.make("while", (), "int", start, attribute=number, region=outer)
-    projected = projections(program, loop, [(carry.shape, carry.dtype) for carry in start])
-    return [_with_known(program, node, *one) for node, one in zip(projected, steady, strict=True)]
+    holds = SIMPLE["reduce_or"](program, holds, axes=range(len(holds.shape)))
+    program.loops[region[-1]] = Loop(carries, [holds], after)
+    loop = program.make("while", (), "int", start, attribute=region[-1], region=region[:-1])
+    return _with_known(program, projections(program, loop, results), steady)
 
 
 def _scan(program: Program, *args: Node, length: int, jaxpr: Any, reverse: bool, results: Sequence[Any]) -> list[Node]:
@@ -105,20 +108,19 @@ def _scan(program: Program, *args: Node, length: int, jaxpr: Any, reverse: bool,
     constants = alike(args, inner.invars) - count
     fixed, start, stacked = args[:constants], args[constants : constants + count], args[constants + count :]
     if length == 0:
-        left = results[count:]
-        return [*start, *(program.constant(np.zeros(aval.shape), kind_of(aval.dtype)) for aval in left)]
-    outer, number, carries = _opened(program, args, start)
-    turn = program.make("counter", (), "index", attribute=number, region=(*outer, number))
+        empty = [program.constant(np.zeros(aval.shape), kind_of(aval.dtype)) for aval in results[count:]]
+        return [*start, *empty]
+    region, carries = _opened(program, args, start)
+    turn = program.make("counter", (), "index", attribute=region[-1], region=region)
     slices = [_slice_of(program, array, turn, length) for array in stacked]
     _, after, steady = _steady(
         program, start, carries, lambda inside: program.inline(program, jaxpr, [*fixed, *inside, *slices])
     )
-    program.loops[number] = Loop(carries, [], after, length, reverse)
-    loop = program.make("repeat", (), "int", start, attribute=number, region=outer)
-    projected = projections(program, loop, [(aval.shape, kind_of(aval.dtype)) for aval in results])
+    program.loops[region[-1]] = Loop(carries, [], after, length, reverse)
+    loop = program.make("repeat", (), "int", start, attribute=region[-1], region=region[:-1])
     stacked = [known(result) for result in after[count:]]
     steady += [(np.tile(mask & program.finite, length), np.tile(numbers, length)) for mask, numbers in stacked]
-    return [_with_known(program, node, *one) for node, one in zip(projected, steady, strict=True)]
+    return _with_known(program, projections(program, loop, results), steady)
 
 
 def _slice_of(program: Program, array: Node, turn: Node, length: int) -> Node:
@@ -133,25 +135,25 @@ def _slice_of(program: Program, array: Node, turn: Node, length: int) -> Node:
     first = program.elementwise("mul", turn, size)
     offsets = program.constant(np.arange(size).reshape(shape), "index")
     taken = indexing.take(program, whole, program.elementwise("add", first, offsets))
-    return _with_known(program, taken, same, numbers[0])
+    return _with_known(program, [taken], [(same, numbers[0])])[0]
 
 
-def _cond(program: Program, which: Node, *operands: Node, branches: Sequence[Any]) -> list[Node]:
+def _cond(
+    program: Program, which: Node, *operands: Node, branches: Sequence[Any], results: Sequence[Any]
+) -> list[Node]:
     if len(branches) == 1 or which.op == "const":
         chosen = int(np.clip(which.value, 0, len(branches) - 1)) if which.value is not None else 0
         return program.inline(program, branches[chosen], operands)
-    floor, outer = program.floor, max((program.floor, which.region, *(node.region for node in operands)), key=len)
-    numbers, every = [], []
+    floor, regions = program.floor, []
     for closed in branches:
-        _, number, _ = _opened(program, [])
-        program.floor = (*outer, number)
-        numbers.append(number)
-        every.append(program.inline(program, closed, operands))
-    program.floor = floor
-    for number, results in zip(numbers, every, strict=True):
-        program.loops[number] = Loop([], [], results)
-    branch = program.make("branch", (), "int", [which], attribute=tuple(numbers), region=outer)
-    return projections(program, branch, [(result.shape, result.dtype) for result in every[0]])
+        region, _ = _opened(program, [which, *operands])
+        regions.append(region)
+        program.floor = region
+        program.loops[region[-1]] = Loop([], [], program.inline(program, closed, operands))
+        program.floor = floor
+    numbers = tuple(region[-1] for region in regions)
+    branch = program.make("branch", (), "int", [which], attribute=numbers, region=regions[0][:-1])
+    return projections(program, branch, results)
 
 
 RULES = {"while": _while, "scan": _scan, "cond": _cond}

@@ -7,10 +7,9 @@ from itertools import pairwise
 import numpy as np
 
 from dln_jax.export.c.body import Body
-from dln_jax.export.c.nodes import Node, is_constant, owners, read_source, strides, values
-from dln_jax.export.c.operations import BY_BITS, OPERATIONS, VECTORISED, expression
-from dln_jax.export.c.simplify import UNROLL_LIMIT
-from dln_jax.export.c.text import C_TYPES, NUMPY_TYPES
+from dln_jax.export.c.nodes import UNROLL_LIMIT, Node, owners, read_source, steps
+from dln_jax.export.c.operations import OPERATIONS, VECTORISED, expression
+from dln_jax.export.c.text import C_TYPES
 
 _CHOICES = {
     "select": "elementary_choice({0}, {1}, {2})",
@@ -23,22 +22,21 @@ _BOXES = 6
 """Largest number of boxes that become separate loops; more are read through tables of positions."""
 
 
-def unrolled(body: Body, node: Node) -> set[Node]:
-    """Writes a scalar as an expression of variables and of the scalars fused into it; returns the nodes written."""
+def unrolled(body: Body, node: Node) -> None:
+    """Writes a scalar as an expression of variables and of the scalars fused into it, or a sine with its cosine."""
     if node in body.plan.beside and not body.source.libm:
         pair = sorted((node, body.plan.beside[node]), key=lambda scalar: scalar.op, reverse=True)
-        body.source.functions.add("sin_cos")
         body.spend(sin=1)
         for scalar in pair:
             body.declared(body.name(scalar), "real", 0)
         body.line("elementary_sin_cos({}, &{}, &{});".format(body.read(node.args[0], _FIRST), *map(body.name, pair)))
-        return {*pair}
+        body.done.update(pair)
+        return
     text = _scalar(body, node, node)
     if node in body.plan.arrays:
         body.line(f"{body.kept(node)}[0] = {text};")
     else:
         body.declared(body.name(node), node.dtype, 0, text)
-    return {node}
 
 
 def _scalar(body: Body, node: Node, root: Node) -> str:
@@ -60,32 +58,11 @@ def _expression(body: Body, node: Node, args: list[str], *, looped: bool = False
     if node.dtype == "real" or node.args[0].dtype == "real":
         body.spend(**{node.op: 1})
     if operation.function in VECTORISED and not body.source.libm:
-        body.source.functions.add(node.op)
         return f"elementary_{node.op}({args[0]})"
     if looped and node.dtype == "real" and node.op in _CHOICES:
-        body.source.functions.add("choice")
         return _CHOICES[node.op].format(*args)
-    if (function := BY_BITS.get(node.op)) is not None:
-        body.source.functions.add(function)
-    if name := _guarded(node):
-        body.source.integers.add(name)
-        return f"elementary_{name}({', '.join(args)})"
     # The kind of the operands decides; the result of a comparison is bool.
     return expression(node.op, node.args[-1].dtype, *args, suffix=body.source.suffix)
-
-
-def _guarded(node: Node) -> str | None:
-    """Returns the name of the integer function that keeps an operation from trapping, or None if none is needed."""
-    if node.op.startswith("shift_"):
-        return f"{node.op}_{node.dtype}"
-    if node.op in ("integer_div", "integer_rem"):
-        divisor = node.args[1]
-        if is_constant(divisor) and not np.isin(values(divisor), (0, ~NUMPY_TYPES[node.dtype](0))).any():
-            return None
-        return f"{'quotient' if node.op == 'integer_div' else 'remainder'}_{node.dtype}"
-    if node.op.startswith("to_") and node.args[0].dtype == "real" and node.dtype != "bool":
-        return f"{node.dtype}_of"
-    return None
 
 
 def looped(body: Body, node: Node) -> None:
@@ -93,22 +70,23 @@ def looped(body: Body, node: Node) -> None:
     inside = sorted(
         {node, *(member for member, root in body.plan.root.items() if root is node)}, key=lambda member: member.number
     )
-    where: dict[Node, np.ndarray] = {}
+    where: dict[Node, tuple[Node, np.ndarray]] = {}
     index = np.arange(node.size).reshape(node.shape)
     for member in inside:
         for arg in member.args[1:] if member.op == "take" else member.args:
             if arg not in inside:
-                where[arg] = index if arg.size == node.size else np.zeros_like(index)
+                positions = index if arg.size == node.size else np.zeros_like(index)
+                moved = arg.op == "gather" and arg not in body.plan.arrays
+                where[arg] = read_source(arg, positions) if moved else (arg, positions)
     target = body.kept(node)
     if node.op in VECTORISED and not body.source.libm:
         body.spend(**{node.op: node.size})
-        body.source.arrays.add(node.op)
         body.line(f"elementary_{node.op}_each({node.size}, {body.name(node.args[0])}, {target});")
         return
-    shape = _merged(node.shape, [_steps(body, arg, positions) for arg, positions in where.items()])
+    shape = _merged(node.shape, [steps(positions) for _, positions in where.values()])
     names = _variables(shape)
     with body.loops(dict(zip(names, shape, strict=True))):
-        text = {arg: body.read(arg, positions.reshape(shape), names) for arg, positions in where.items()}
+        text = {arg: body.read(source, at.reshape(shape), names) for arg, (source, at) in where.items()}
         for member in inside:
             if member.op == "take":
                 written = f"{body.name(member.args[0])}[{text[member.args[1]]}]"
@@ -127,22 +105,14 @@ def _variables(shape: Sequence[int]) -> list[str]:
     return [f"i{axis}_" for axis in range(len(shape))]
 
 
-def _steps(body: Body, node: Node, positions: np.ndarray) -> tuple[int, ...] | None:
-    """Returns the strides of a read, or None if it needs a table."""
-    if node.op == "gather" and node not in body.plan.arrays:
-        positions = np.asarray(np.asarray(node.value).ravel()[positions])
-    linear = strides(positions)
-    return None if linear is None else linear[1]
-
-
-def _merged(shape: Sequence[int], steps: list[tuple[int, ...] | None]) -> list[int]:
+def _merged(shape: Sequence[int], steps: list[list[int | None]]) -> list[int]:
     """Returns the shape with adjacent axes merged where all reads allow it; at least one axis remains."""
     result: list[int] = []
     kept: list[int] = []
     for axis, extent in enumerate(shape):
-        if extent == 1 and len(shape) > 1 and (result or axis + 1 < len(shape)):
+        if extent == 1:
             continue
-        if kept and all(step is not None and step[kept[-1]] == step[axis] * extent for step in steps):
+        if kept and all(None not in step and step[kept[-1]] == (step[axis] or 0) * extent for step in steps):
             result[-1] *= extent
             kept[-1] = axis
         else:
@@ -189,7 +159,7 @@ def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:
 
     def split(box: np.ndarray) -> list[np.ndarray]:
         at, of = flat[box], owner[box]
-        if strides(at) is not None and (of == of.flat[0]).all():
+        if None not in steps(at) and (of == of.flat[0]).all():
             return [box]
         cuts = {axis: _runs(np.moveaxis(at, axis, 0), np.moveaxis(of, axis, 0)) for axis in range(at.ndim)}
         axis = min(

@@ -1,17 +1,17 @@
 """Writes a planned program as the body of a C function, region by region."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import nullcontext
 
 import numpy as np
 
-from dln_jax.export.c import elements, kernels, products
+from dln_jax.export.c import elements, kernels
 from dln_jax.export.c.body import Body, Called, Source
 from dln_jax.export.c.elements import copied
-from dln_jax.export.c.nodes import Loop, Node, is_constant, values
+from dln_jax.export.c.nodes import Loop, Node, Region, is_constant, values
 from dln_jax.export.c.operations import OPERATIONS, total
-from dln_jax.export.c.plan import plan_of
+from dln_jax.export.c.plan import needed_by, plan_of
 from dln_jax.export.c.program import Program
 from dln_jax.export.c.text import C_TYPES, failure, literal
 
@@ -45,7 +45,7 @@ def body_of(
                 _from_array(body, f"r{k}_", results[k].size, target)
             else:
                 copied(body, results[k], target)
-    body.stack += max((source.parts[key].stack for key in body.calls), default=0)
+    body.stack += max((source.parts[key].body.stack for key in body.calls), default=0)
     return body
 
 
@@ -60,45 +60,31 @@ def _from_array(body: Body, source: str, size: int, target: str) -> None:
     body.line(f"for (int k_ = 0; k_ < {size}; ++k_) {target}[k_] = {source}[k_];")
 
 
-def region(body: Body, region: tuple[int, ...], done: set[Node] | None = None, only: set[Node] | None = None) -> None:
-    """Writes the nodes of a region that are not done yet; `only` restricts them to a set."""
-    done = set() if done is None else done
-    for node in body.plan.order.get(region, []):
-        if node not in done and (only is None or node in only):
-            done.add(node)
-            _computed(body, node, done, only)
+def region(body: Body, region: Region, only: Collection[Node] | None = None) -> None:
+    """Writes the nodes of a region that are not written yet; `only` restricts them to a set."""
+    nodes = [node for node in body.plan.order.get(region, []) if only is None or node in only]
+    for node in nodes:
+        if node not in body.done:
+            _computed(body, node, nodes)
             body.finished(node)
 
 
-def ancestors(body: Body, nodes: Sequence[Node]) -> set[Node]:
-    """Returns these nodes, all nodes that they need, and the loops that compute them."""
-    needed, waiting = set(), list(nodes)
-    while waiting:
-        node = waiting.pop()
-        if node not in needed:
-            needed.add(node)
-            waiting += [*node.args, *([body.plan.root[node]] if node in body.plan.root else [])]
-    return needed
-
-
-def _computed(body: Body, node: Node, done: set[Node], only: set[Node] | None) -> None:
+def _computed(body: Body, node: Node, among: list[Node]) -> None:
+    """Writes a node, and those among its region that the same C computes."""
     plan = body.plan
-    if node.op in ("input", "const", "carry", "counter", "project"):
-        return
+    body.done.add(node)
     if node.op == "gather":
-        if node in plan.arrays:
-            copied(body, node, body.kept(node), own=True)
+        copied(body, node, body.kept(node), own=True)
     elif node in plan.unrolled:
-        done |= elements.unrolled(body, node)
+        elements.unrolled(body, node)
     elif node.op == "dot_general":
         members = [
-            other for other in plan.order[node.region]
-            if other.op == "dot_general" and other not in done and other not in plan.unrolled
-            and (only is None or other in only)
+            other for other in among
+            if other.op == "dot_general" and other not in body.done
             and other.args[1] is node.args[1] and plan.levels[other] == plan.levels[node]
         ]  # fmt: skip
-        done.update(members)
-        products.dot_general(body, [node, *members])
+        body.done.update(members)
+        kernels.dot_general(body, [node, *members])
         for member in members:
             body.finished(member)
     elif node.op in OPERATIONS or node.op == "take":
@@ -113,13 +99,13 @@ def _call(body: Body, node: Node) -> None:
     if key not in source.parts:
         source.parts[key] = _part(source, *body.program.parts[key])
     called = source.parts[key]
-    body.calls |= {key, *called.calls}
+    body.calls |= {key, *called.body.calls}
     names = [f"v{node.number}_{k}" for k in range(len(called.results))]
     for name, result in zip(names, called.results, strict=True):
         body.declared(name, result.dtype, max(result.size, 1))
     body.line(f"{called.name}({', '.join([*map(body.pointer, node.args), *names])});")
-    body.spend(**called.operations)
-    body.unbounded += called.unbounded
+    body.spend(**called.body.operations)
+    body.unbounded += called.body.unbounded
 
 
 def _part(source: Source, program: Program, results: list[Node]) -> Called:
@@ -128,13 +114,11 @@ def _part(source: Source, program: Program, results: list[Node]) -> Called:
     body = body_of(source, program, results, {k: (f"a{k}_", False) for k in inputs}, targets, apart=True)
     parameters = [f"const {C_TYPES[inputs[k].dtype]} *RESTRICT a{k}_" for k in sorted(inputs)]
     parameters += [f"{C_TYPES[node.dtype]} *RESTRICT {target}" for node, target in zip(results, targets, strict=True)]
-    unused = [f"    (void)a{k}_;" for k in sorted(inputs) if not body.uses(inputs[k])]
+    unused = [f"    (void)a{k}_;" for k in sorted(inputs) if inputs[k] not in body.plan.nodes]
     unused += [f"    (void){target};" for result, target in zip(results, targets, strict=True) if not result.size]
     lines = "\n".join([*unused, *body.lines])
-    text = f"({', '.join(parameters)})\n{{\n{lines}\n}}\n"
-    name = source.names.setdefault(text, f"part_{len(source.names)}")
-    written = f"\nstatic void {name}{text}"
-    return Called(name, results, written, body.operations, body.unbounded, body.stack, body.calls)
+    name = f"part_{len(source.parts)}"
+    return Called(name, results, f"\nstatic void {name}({', '.join(parameters)})\n{{\n{lines}\n}}\n", body)
 
 
 def _stored(body: Body, node: Node, results: Sequence[Node], turns: int = 1) -> list[str]:
@@ -143,15 +127,15 @@ def _stored(body: Body, node: Node, results: Sequence[Node], turns: int = 1) -> 
     A loop has its carries, initialised with its arguments, then the outputs of all `turns` iterations.
     """
     number = np.ravel(node.attribute)[0]
-    carried = len(node.args) if node.op != "branch" else len(results)
+    starts = () if node.op == "branch" else node.args
     names = [f"c{number}_{index}" for index in range(len(results))]
     for index, (name, result) in enumerate(zip(names, results, strict=True)):
-        body.declared(name, result.dtype, max(result.size * (turns if index >= carried else 1), 1))
-    for name in (name for index, name in enumerate(names) if index not in body.projected(node)):
+        body.declared(name, result.dtype, max(result.size * (turns if index >= len(starts) else 1), 1))
+    read = body.projected(node)
+    for name in (name for index, name in enumerate(names) if index not in read):
         body.line(f"(void){name};")
-    if node.op != "branch":
-        for name, start in zip(names[:carried], node.args, strict=True):
-            copied(body, start, name)
+    for name, start in zip(names, starts, strict=False):
+        copied(body, start, name)
     return names
 
 
@@ -179,9 +163,8 @@ def _while(body: Body, node: Node) -> None:
     if stopped:
         body.declared(f"t{number}", "int", 0)
     with body.block(f"for (t{number} = 0;; ++t{number})" if stopped else "for (;;)"):
-        done: set[Node] = set()
         with body.repeated(1 if turns is None else turns + 1):
-            region(body, inside, done, ancestors(body, loop.conditions))
+            region(body, inside, {*needed_by(body.program, loop.conditions)})
         body.line(f"if (!{body.read(loop.conditions[0], np.array(0))}) break;")
         if stopped:
             with body.block(f"if (t{number} == {stopped})"):
@@ -190,20 +173,19 @@ def _while(body: Body, node: Node) -> None:
                     body.line(f"for (int k_ = 0; k_ < {carry.size}; ++k_) {name}[k_] = {value};")
                 body.line("break;")
         with body.repeated(1 if turns is None else turns):
-            region(body, inside, done)
+            region(body, inside)
             _carry_over(body, loop, names, number)
 
 
 def _bound(node: Node, loop: Loop) -> int | None:
     """Returns the largest number of iterations of a `while` whose condition compares a counter, or None."""
     waiting, bounds = [*loop.conditions], []
-    while waiting:
-        test = waiting.pop()
+    for test in waiting:
         if test.op == "and" and test.dtype == "bool":
             waiting += test.args
         elif test.op in ("lt", "le", "gt", "ge"):
             counter, last = test.args if test.op in ("lt", "le") else test.args[::-1]
-            if counter.op == "carry" and counter in loop.carries and is_constant(last) and counter.dtype != "real":
+            if counter in loop.carries and is_constant(last) and counter.dtype != "real":
                 place = loop.carries.index(counter)
                 start, after = node.args[place], loop.results[place]
                 steps = [arg for arg in after.args if arg is not counter] if after.op == "add" else []
@@ -220,8 +202,7 @@ def _repeat(body: Body, node: Node) -> None:
     stacked = [index for index in sorted(body.projected(node)) if index >= carried]
     turn = f"{length - 1} - t{number}" if loop.reverse else f"t{number}"
     with body.loops({f"t{number}": length}):
-        counters = (counter for counter in body.plan.needed if counter.op == "counter" and counter.attribute == number)
-        if stacked or any(map(body.uses, counters)):
+        if stacked or any(node.op == "counter" and node.attribute == number for node in body.plan.nodes):
             body.line(f"const long long i_{number} = {turn};")
         region(body, (*node.region, number))
         for index in stacked:

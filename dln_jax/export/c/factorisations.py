@@ -228,7 +228,6 @@ _SIZES = {
 
 def _call(body: Body, node: Node) -> None:
     """Calls a node's C function with sizes, pointers to the arguments, and arrays for the results."""
-    body.source.kernels.add(node.op)
     *sizes, operations = _SIZES[node.op](*(arg.shape for arg in node.args), node.shape)
     a, arrays = node.args[0], []
     if node.op == "lu":  # results of two types, which `project` nodes read

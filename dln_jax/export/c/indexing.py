@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 from jax.extend import core
 
-from dln_jax.export.c.nodes import Node, is_constant, values
+from dln_jax.export.c.nodes import VECTOR, Node, is_constant, values
 from dln_jax.export.c.primitives import Rule, convert, rows_of
 from dln_jax.export.c.program import Program
-from dln_jax.export.c.simplify import VECTOR
 from dln_jax.export.c.text import UNSIGNED, limit
 
 _COMBINED = ("add", "sub", "mul", "min", "max")
@@ -27,16 +26,15 @@ def _gather(
         program, indices, operand.shape, slice_sizes, mode, numbers.start_index_map,
         dropped=(*numbers.collapsed_slice_dims, *numbers.operand_batching_dims),
         batched=(numbers.operand_batching_dims, numbers.start_indices_batching_dims),
-        order=np.argsort([*outer, *numbers.offset_dims]),
     )  # fmt: skip
-    taken = take(program, operand, positions)
-    if inside is None:
-        return taken
     if fill_value is None:  # JAX's default
         fill_value = (
             np.nan if operand.dtype == "real" else limit(operand.dtype, upper=operand.dtype in ("bool", *UNSIGNED))
         )
-    return program.select(inside, program.constant(fill_value, operand.dtype), taken)
+    taken = take(program, operand, positions)
+    result = program.elementwise("select", inside, taken, program.constant(fill_value, operand.dtype))
+    order = np.argsort([*outer, *numbers.offset_dims])
+    return program.gather([result], np.arange(result.size).reshape(result.shape).transpose(order))
 
 
 def _scatter(op: str) -> Rule:
@@ -53,75 +51,54 @@ def _scatter(op: str) -> Rule:
         targets, inside = _windows(
             program, indices, operand.shape, sizes, mode, numbers.scatter_dims_to_operand_dims,
             dropped=dropped, batched=(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims),
-            order=np.arange(len(updates.shape)),
         )  # fmt: skip
-        if inside is not None:
-            targets = program.select(inside, program.constant(-1, "index"), targets)
+        targets = program.elementwise("select", inside, targets, program.constant(-1, "index"))
         outer = [axis for axis in range(len(updates.shape)) if axis not in numbers.update_window_dims]
         order = np.arange(updates.size).reshape(updates.shape).transpose([*outer, *numbers.update_window_dims])
         updates = program.gather([updates], order)
         if op == "set" and update_jaxpr is not None:  # of `x.at[i].apply(f)`
-            return _updated(program, update_jaxpr, update_consts, operand, targets, updates)
+            return _updated(program, core.ClosedJaxpr(update_jaxpr, update_consts), operand, targets, updates)
         return _put(program, op, operand, targets, updates)
 
     return rule
 
 
 def _windows(
-    program: Program, indices: Node, shape, sizes, mode: Any, axes, *, dropped, batched, order
-) -> tuple[Node, Node | None]:
-    """Returns the flat positions of windows and, if windows outside are dropped, which positions are inside.
+    program: Program, indices: Node, shape, sizes, mode: Any, axes, *, dropped=(), batched=((), ())
+) -> tuple[Node, Node]:
+    """Returns the flat positions of windows, clamped into the operand, and which to keep if those outside are dropped.
 
     Args:
         program: program in which they are computed.
         indices: corners of the windows [batch, axes].
+        shape: shape of the operand.
         sizes: size of a window along each axis of the operand.
         mode: mode of `lax.gather` or `lax.scatter`, for windows outside.
         axes: axes of the operand that the indices refer to.
         dropped: axes of the operand that a window lacks.
         batched: corresponding axes of the operand and of the indices.
-        order: order of the result's axes, among those of the batch followed by those of a window.
     """
-    batch, index = indices.shape[:-1], np.arange(indices.size).reshape(indices.shape)
-    flat = np.zeros(batch, np.int64)
+    batch, fills = indices.shape[:-1], "FILL" in str(mode).upper()
+    index, steps = np.arange(indices.size).reshape(indices.shape), [prod(shape[k + 1 :]) for k in range(len(shape))]
+    first = np.zeros(batch, np.int64)
     for axis, of_indices in zip(*batched, strict=True):
-        flat = flat + np.indices(batch)[of_indices] * _stride(shape, axis)
-    starts = {axis: program.gather([indices], index[..., component]) for component, axis in enumerate(axes)}
-    corners, inside = _corners(program, starts, shape, sizes, flat, fills="FILL" in str(mode).upper())
-    kept = [axis for axis in range(len(shape)) if axis not in dropped]
-    window = [sizes[axis] for axis in kept]
-
-    def placed(array: np.ndarray) -> np.ndarray:
-        return np.broadcast_to(array, (*batch, *window)).transpose(order)
-
-    windows = np.arange(prod(batch)).reshape((*batch, *[1] * len(window)))
-    positions = program.elementwise(
-        "add",
-        program.gather([corners], placed(windows)),
-        program.constant(placed(_offsets(shape, kept, window)), "index"),
-    )
-    return positions, None if inside is None else program.gather([inside], placed(windows))
-
-
-def _corners(program: Program, starts: dict[int, Node], shape, sizes, first, *, fills=False) -> tuple[Node, Any]:
-    """Returns the flat positions of windows' corners, clamped into the operand; with `fills`, also which were inside.
-
-    `starts` are the corner indices by axis of the operand; they are added to the flat positions `first`.
-    """
-    flat, inside = program.constant(first, "index"), None
-    for axis, start in starts.items():
-        last = shape[axis] - sizes[axis]
-        start = _index(program, start, last + fills)
+        first = first + np.indices(batch)[of_indices] * steps[axis]
+    corners, inside = program.constant(first, "index"), program.constant(np.ones(batch), "bool")
+    for component, axis in enumerate(axes):
+        start, last = program.gather([indices], index[..., component]), shape[axis] - sizes[axis]
+        if start.dtype == "unsigned_long":  # an index may not hold it
+            start = program.elementwise("min", start, max(last + fills, 0))
+        start = convert(program, start, "index")
         if fills:
-            within = program.elementwise(
-                "and", program.elementwise("ge", start, 0), program.elementwise("le", start, last)
-            )
-            inside = within if inside is None else program.elementwise("and", inside, within)
+            for comparison, bound in (("ge", 0), ("le", last)):
+                inside = program.elementwise("and", inside, program.elementwise(comparison, start, bound))
         clamped = program.elementwise("min", program.elementwise("max", start, 0), last)
-        flat = program.elementwise("add", flat, program.elementwise("mul", clamped, _stride(shape, axis)))
-    if inside is not None and is_constant(inside) and values(inside).all():
-        inside = None
-    return flat, inside
+        corners = program.elementwise("add", corners, program.elementwise("mul", clamped, steps[axis]))
+    offsets = np.arange(prod(shape)).reshape(shape)[tuple(map(slice, sizes))].squeeze(tuple(dropped))
+    shape = (*batch, *offsets.shape)
+    windows = np.broadcast_to(np.arange(prod(batch)).reshape((*batch, *[1] * offsets.ndim)), shape)
+    within = program.constant(np.broadcast_to(offsets, shape), "index")
+    return program.elementwise("add", program.gather([corners], windows), within), program.gather([inside], windows)
 
 
 def take(program: Program, operand: Node, positions: Node) -> Node:
@@ -138,39 +115,42 @@ def _put(program: Program, op: str, operand: Node, targets: Node, updates: Node)
     """Returns the operand with updates set at, or combined with, flat targets; negative targets are dropped."""
     if not is_constant(targets):
         return program.make(f"put_{op}", operand.shape, operand.dtype, [operand, targets, updates])
-    flat, index = values(targets).ravel(), np.arange(operand.size)
+    flat = values(targets).ravel()
     left = np.flatnonzero(flat >= 0)
-    if op == "set":
-        index[flat[left]] = operand.size + left
-        return program.gather([operand, updates], index.reshape(operand.shape))
     while left.size:  # a pass handles one update per target
         _, first = np.unique(flat[left], return_index=True)
         now = left[first]
-        combined = program.elementwise(op, program.gather([operand], flat[now]), program.gather([updates], now))
+        new = program.gather([updates], now)
+        if op != "set":
+            new = program.elementwise(op, program.gather([operand], flat[now]), new)
         index = np.arange(operand.size)
         index[flat[now]] = operand.size + np.arange(now.size)
-        operand = program.gather([operand, combined], index.reshape(operand.shape))
+        operand = program.gather([operand, new], index.reshape(operand.shape))
         left = np.delete(left, first)
     return operand
 
 
-def _updated(program: Program, jaxpr: Any, constants, operand: Node, targets: Node, updates: Node) -> Node:
-    """Returns the operand after `jaxpr` of an element and an update, at one target after the other."""
-    closed = core.ClosedJaxpr(jaxpr, constants)
-    for place in range(targets.size):
-        target, update = (program.gather([node], np.array([place])) for node in (targets, updates))
+def _updated(program: Program, closed: Any, operand: Node, targets: Node, updates: Node) -> Node:
+    """Returns the operand after a jaxpr of an element and an update, at one target after the other."""
+    for target, update in zip(program.scalars(targets), program.scalars(updates), strict=True):
         old = take(program, operand, program.elementwise("max", target, 0))
-        (new,) = program.inline(program, closed, [program.one(old), program.one(update)])
-        operand = _put(program, "set", operand, target, program.reshape(new, (1,)))
+        (new,) = program.inline(program, closed, [old, update])
+        operand = _put(program, "set", operand, target, new)
     return operand
 
 
 def _dynamic_slice(program: Program, operand: Node, *starts: Node, slice_sizes) -> Node:
-    return take(program, operand, _window(program, operand.shape, slice_sizes, starts[: len(slice_sizes)]))
+    return take(program, operand, _window(program, operand, slice_sizes, starts))
 
 
 def _dynamic_update_slice(program: Program, operand: Node, update: Node, *starts: Node) -> Node:
-    return _put(program, "set", operand, _window(program, operand.shape, update.shape, starts), update)
+    return _put(program, "set", operand, _window(program, operand, update.shape, starts), update)
+
+
+def _window(program: Program, operand: Node, sizes, starts: Sequence[Node]) -> Node:
+    """Returns the flat positions of one window with these corner indices."""
+    corner = program.gather(starts or [program.constant(0, "int")], np.arange(len(starts)))
+    return _windows(program, corner, operand.shape, sizes, None, range(len(starts)))[0]
 
 
 def _sort(program: Program, *nodes: Node, dimension: int, num_keys: int) -> list[Node]:
@@ -179,33 +159,13 @@ def _sort(program: Program, *nodes: Node, dimension: int, num_keys: int) -> list
     if shape[axis] < 2:
         return list(nodes)
     rows = [rows_of(program, node, (axis,)) for node in nodes]
-    order = program.make("order", rows[0].shape, "index", rows[:num_keys])
+    *others, last_key = rows[:num_keys]
+    order = program.make("order", last_key.shape, "index", [last_key])
+    for key in reversed(others):  # the sort is stable, so the first key comes last
+        order = take(program, order, program.make("order", key.shape, "index", [take(program, key, order)]))
     last = np.moveaxis(np.empty(shape), axis, -1).shape
     back = np.moveaxis(np.arange(nodes[0].size).reshape(last), -1, axis)
     return [program.gather([take(program, row, order)], back) for row in rows]
-
-
-def _window(program: Program, shape, sizes, starts: Sequence[Node]) -> Node:
-    """Returns the flat positions of a window whose corner is clamped into the operand."""
-    corner, _ = _corners(program, dict(enumerate(starts)), shape, sizes, 0)
-    return program.elementwise("add", corner, program.constant(_offsets(shape, range(len(shape)), sizes), "index"))
-
-
-def _index(program: Program, start: Node, upper: int) -> Node:
-    """Returns an index; unsigned 64-bit indices are clamped before conversion, because an index cannot hold them."""
-    if start.dtype == "unsigned_long":
-        start = program.elementwise("min", start, max(upper, 0))
-    return convert(program, start, "index")
-
-
-def _stride(shape, axis: int | np.integer) -> int:
-    return int(np.prod(shape[axis + 1 :], dtype=np.int64))
-
-
-def _offsets(shape, axes, sizes) -> np.ndarray:
-    """Returns the flat offsets [sizes] of a window along these axes."""
-    steps = [np.arange(size) * _stride(shape, axis) for axis, size in zip(axes, sizes, strict=True)]
-    return np.asarray(sum(np.ix_(*steps), np.zeros([1] * len(steps), np.int64)))
 
 
 RULES = {

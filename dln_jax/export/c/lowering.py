@@ -1,25 +1,28 @@
-"""Lowers a jaxpr to a program: inlines calls, keeps control flow, and applies a rule for every primitive."""
+"""Traces functions, and lowers their jaxprs to programs: inlines calls and applies a rule for every primitive."""
 
 import inspect
-from collections.abc import Collection, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
+import jax
 import numpy as np
 from jax.dtypes import float0
+from jax.extend import core
 
-from dln_jax.export.c import control_flow, indexing, linear_algebra, primitives
-from dln_jax.export.c.jaxprs import closed_jaxpr, expanded, implementation, is_error_of_equinox, made_at
+from dln_jax.export.c import control_flow, indexing, primitives
 from dln_jax.export.c.nodes import Node, is_constant, values
-from dln_jax.export.c.program import Part, Program
+from dln_jax.export.c.operations import OPERATIONS
+from dln_jax.export.c.program import Program
 from dln_jax.export.c.text import PRECISIONS, failure, kind_of
 from dln_jax.types import InputError
 
+_LARGE_CALL = 600
+"""A jitted function with at least this many equations that is called several times becomes a C function."""
 _CALLS = {
-    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "remat": "jaxpr",
-    "checkpoint": "jaxpr", "eval_jaxpr": "call_jaxpr", "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr", "remat2": "jaxpr", "custom_vjp_call_jaxpr": "fun_jaxpr",
-    "custom_vmap_call": "call",
+    "jit": "jaxpr", "closed_call": "call_jaxpr", "remat2": "jaxpr", "eval_jaxpr": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "custom_vmap_call": "call",
 }  # fmt: skip
 _WITHOUT_EFFECT = frozenset((
     "accuracy", "algorithm", "use_magma", "sharding", "out_sharding", "unroll", "linear",
@@ -36,14 +39,58 @@ _REFUSED = {
 }
 
 
+def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, Any]:
+    """Returns the closed jaxpr of a function, and the tree of its results.
+
+    Raises:
+        InputError: the function has side effects, integers beyond 64 bits, or branches of Python on an argument.
+    """
+    try:
+        closed, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
+    except jax.errors.ConcretizationTypeError as error:
+        raise InputError(
+            "the function needs the value of an argument in Python, such as for `if x > 0`; write jnp.where or lax.cond"
+        ) from error
+    except OverflowError as error:
+        raise InputError(f"a whole number is out of range ({error}); C has integers of up to 64 bits") from error
+    if closed.effects:
+        raise InputError(f"the function has side effects ({', '.join(map(str, closed.effects))}); C export takes none")
+    return closed, shapes
+
+
+def repeated_calls(every: Sequence[Any]) -> set[int]:
+    """Returns the `id` values of large jaxprs that these closed jaxprs call several times.
+
+    Calls of one jitted function with arguments of equal types share a jaxpr, which JAX keeps.
+    """
+    sizes: dict[int, int] = {}
+    counts: Counter[int] = Counter()
+
+    def size(jaxpr: Any) -> int:
+        """Returns the number of equations, including those of calls."""
+        if id(jaxpr) not in sizes:
+            total = 0
+            for equation in _closed(jaxpr).jaxpr.eqns:
+                leaves = jax.tree.leaves(equation.params) if _of_jax(equation.primitive) else []
+                inside = [leaf for leaf in leaves if hasattr(leaf, "eqns") or hasattr(leaf, "jaxpr")]
+                counts.update(map(id, inside))
+                total += max(1, sum(map(size, inside)))
+            sizes[id(jaxpr)] = total
+        return sizes[id(jaxpr)]
+
+    for closed in every:
+        size(closed)
+    return {identity for identity, count in counts.items() if count > 1 and sizes[identity] >= _LARGE_CALL}
+
+
 def program_of(
     closed: Any, repeated: Collection[int] = (), *, precision: str = "f64", finite: bool = False
 ) -> tuple[Program, list[Node], list[Node]]:
     """Returns the program of a closed jaxpr, its inputs and its results.
 
     Args:
-        closed: the jaxpr, as `jaxprs.traced` returns it.
-        repeated: `id` values of jaxprs whose calls stay calls in the program.
+        closed: the jaxpr, as `traced` returns it.
+        repeated: `id` values of jaxprs whose calls stay calls in the program, from `repeated_calls`.
         precision: f32 or f64.
         finite: arguments and intermediate results are finite numbers.
 
@@ -72,11 +119,12 @@ def _inline(program: Program, closed: Any, args: Sequence[Node]) -> list[Node]:
         try:
             results = _apply(program, equation, [read(variable) for variable in equation.invars])
         except InputError as error:
-            where = "" if " (made at " in str(error) else made_at(equation)
+            where = "" if " (made at " in str(error) else _made_at(equation)
             raise InputError(f"{error}{where}") from error
         for variable, result in zip(equation.outvars, results, strict=True):
             expected = tuple(variable.aval.shape), kind_of(variable.aval.dtype)
-            assert (result.shape, result.dtype) == expected, f"{equation.primitive.name} became {result}"
+            made = result.shape, result.dtype
+            assert made == expected, f"{equation.primitive.name} became {made}, not {expected}"
             nodes[variable] = result
     return [read(variable) for variable in jaxpr.outvars]
 
@@ -89,7 +137,8 @@ def _constant(program: Program, value: Any, aval: Any) -> Node:
 
 
 def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
-    name, parameters = equation.primitive.name, equation.params
+    primitive, parameters = equation.primitive, equation.params
+    name = primitive.name
     for variable in equation.outvars:
         if not all(isinstance(size, int | np.integer) for size in getattr(variable.aval, "shape", ())):
             raise InputError(f"an array has shape {variable.aval.shape}; expected sizes that are known beforehand")
@@ -97,58 +146,64 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
         inner = parameters[_CALLS[name]]
         if id(inner) in program.repeated:
             return _call(program, inner, args)
-        return _inline(program, closed_jaxpr(inner), args)
+        return _inline(program, _closed(inner), args)
     if name == "call_hi_primitive":
-        return _inline(program, expanded(parameters["_prim"]), args)
-    results = [variable.aval for variable in equation.outvars]
-    if is_error_of_equinox(equation):
-        return [_failed(program, aval) for aval in results]
-    if name in _RULES:
+        high = parameters["_prim"]
+        return primitives.composed(
+            program, lambda *leaves: jax.tree.leaves(high.expand(*jax.tree.unflatten(high.in_tree, leaves))), args
+        )
+    if _is_error_of_equinox(equation):
+        # C cannot raise an error: the results are NaN, the largest integers or true.
+        kinds = [kind_of(variable.aval.dtype) for variable in equation.outvars]
+        missing = [program.constant(failure(kind), kind) for kind in kinds]
+        return [
+            program.broadcast(node, variable.aval.shape)
+            for node, variable in zip(missing, equation.outvars, strict=True)
+        ]
+    if name in _RULES or name in OPERATIONS:
         return _ruled(program, equation, args)
     if why := next((reason for part, reason in _REFUSED.items() if part in name), None):
         raise InputError(f"'{name}' is {why}")
-    inner = implementation(equation, [values(arg) if is_constant(arg) else None for arg in args])
-    if inner is None:
+    if _of_jax(primitive):
         raise InputError(f"the primitive '{name}' has no C")
-    return _inline(program, inner, [arg for arg in args if not is_constant(arg)])
+
+    def run(*unknown: Any) -> list[Any]:
+        left = iter(unknown)
+        return jax.tree.leaves(
+            primitive.impl(*(next(left) if fixed is None else fixed for fixed in known), **parameters)
+        )
+
+    # Another library's primitive, such as Equinox's, may need the values of constant arguments.
+    known = [values(arg) if is_constant(arg) else None for arg in args]
+    return primitives.composed(program, run, [arg for arg in args if not is_constant(arg)])
 
 
 def _ruled(program: Program, equation: Any, args: list[Node]) -> list[Node]:
     """Returns the results by the primitive's rule; refuses parameters that the rule does not read."""
     name, results = equation.primitive.name, [variable.aval for variable in equation.outvars]
-    read = inspect.signature(_RULES[name]).parameters
+    rule = _RULES.get(name) or (lambda program, *args: program.elementwise(name, *args))
+    read = inspect.signature(rule).parameters
     for key, value in equation.params.items():
         if key not in read and key not in _WITHOUT_EFFECT and value is not None and value is not False:
             raise InputError(f"the primitive '{name}' has no C with {key}={value}".partition("\n")[0])
     if results and all(0 in aval.shape for aval in results):
         return [program.constant(np.zeros(aval.shape), kind_of(aval.dtype)) for aval in results]
     known = {**equation.params, "results": results, "kind": kind_of(results[0].dtype) if results else None}
-    nodes = _RULES[name](program, *args, **{key: known[key] for key in read if key in known})
+    nodes = rule(program, *args, **{key: known[key] for key in read if key in known})
     return list(nodes) if isinstance(nodes, list | tuple) else [nodes]
-
-
-def _failed(program: Program, aval: Any) -> Node:
-    """Returns the value that stands for an error, which C cannot raise: NaN, the largest integer or true."""
-    kind = kind_of(aval.dtype)
-    return program.broadcast(program.constant(failure(kind), kind), aval.shape)
 
 
 def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
     """Returns the results of a call; constant arguments become part of the called function."""
-    fixed = {k: arg for k, arg in enumerate(args) if is_constant(arg)}
-    call = id(closed), tuple((k, values(arg).tobytes()) for k, arg in fixed.items())
+    call = id(closed), tuple((k, values(arg).tobytes()) for k, arg in enumerate(args) if is_constant(arg))
+    passed = [arg for arg in args if not is_constant(arg)]
     if call not in program.parts:
         part = replace(program, nodes=[], loops={}, floor=(), _interned={}, _scalars={})
-        inside = [
-            part.constant(values(arg), arg.dtype)
-            if k in fixed
-            else part.make("input", arg.shape, arg.dtype, attribute=k - sum(place < k for place in fixed))
-            for k, arg in enumerate(args)
-        ]
-        program.parts[call] = Part(part, _inline(part, closed, inside))
-    shapes = [(result.shape, result.dtype) for result in program.parts[call].results]
-    passed = [arg for k, arg in enumerate(args) if k not in fixed]
-    return control_flow.projections(program, program.make("call", (), "int", passed, attribute=call), shapes)
+        inputs = iter([part.make("input", arg.shape, arg.dtype, attribute=k) for k, arg in enumerate(passed)])
+        inside = [part.constant(values(arg), arg.dtype) if is_constant(arg) else next(inputs) for arg in args]
+        program.parts[call] = part, _inline(part, closed, inside)
+    made = program.make("call", (), "int", passed, attribute=call)
+    return control_flow.projections(program, made, _closed(closed).out_avals)
 
 
 def _custom_linear_solve(program: Program, *args: Node, const_lengths: Any, jaxprs: Any) -> list[Node]:
@@ -164,10 +219,34 @@ def _platform(program: Program, *, platforms) -> Node:
     return program.constant(np.int32(places[0]), "int")
 
 
+def _of_jax(primitive: Any) -> bool:
+    return getattr(primitive.impl, "func", primitive.impl).__module__.partition(".")[0] == "jax"
+
+
+def _is_error_of_equinox(equation: Any) -> bool:
+    """Returns whether an equation is the callback that raises the error of `equinox.error_if`."""
+    if equation.primitive.name != "pure_callback":
+        return False
+    callback = equation.params["callback"]
+    return getattr(callback, "callback_func", callback).__module__ == "equinox._errors"
+
+
+def _closed(jaxpr: Any) -> Any:
+    """Returns a jaxpr in closed form; an open jaxpr has no constants."""
+    return jaxpr if hasattr(jaxpr, "consts") else core.ClosedJaxpr(jaxpr, ())
+
+
+def _made_at(equation: Any) -> str:
+    """Returns " (made at FILE:LINE)" for the user's code that made an equation, or "" if JAX kept no traceback."""
+    traceback = equation.source_info.traceback
+    frames = [] if traceback is None else list(traceback.frames)
+    users = [frame for frame in frames if "/jax/" not in frame.file_name and "/dln_jax/export/" not in frame.file_name]
+    return f" (made at {users[0].file_name}:{users[0].line_num})" if users else ""
+
+
 _RULES = {
     **primitives.RULES,
     **indexing.RULES,
-    **linear_algebra.RULES,
     **control_flow.RULES,
     "platform_index": _platform,
     "custom_linear_solve": _custom_linear_solve,

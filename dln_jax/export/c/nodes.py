@@ -1,4 +1,4 @@
-"""Nodes of a program of small arrays, and the values of constant ones."""
+"""Nodes of a program of small arrays, the values of constant ones, and which are written element by element."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,6 +7,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dln_jax.export.c.operations import TRANSCENDENTAL
+
+UNROLL_LIMIT = 64
+"""Largest number of elements of a result, or of products in a sum, that are unrolled; structural zeros are free."""
+VECTOR = 8
+VECTOR_OF_FUNCTIONS = 4
+"""Results with fewer elements are always unrolled; the second limit is for functions of <math.h>."""
+_MOST_ZEROS = 16 * UNROLL_LIMIT
+"""Largest number of elements, including structural zeros, of a result that is unrolled."""
+_MOST_SCALARS = 36
+"""Largest number of elements of an operation on scalars alone that is unrolled; larger ones are faster as loops."""
+_TRIVIAL = {
+    "mul": np.logical_or, "add": np.logical_or, "sub": np.logical_or, "div": lambda a, b: a, "neg": lambda a: a,
+    "select": lambda condition, a, b: a & b,
+}  # fmt: skip
+"""Where an operation on finite numbers costs nothing, given where its arguments are zero."""
 Region = tuple[int, ...]
 """Numbers of the loops and branches around a node, outermost first."""
 
@@ -57,9 +73,7 @@ def is_constant(node: Node) -> bool:
 
 def values(node: Node) -> np.ndarray:
     """Returns the value of a constant node."""
-    if node.op == "const":
-        return np.asarray(node.value)
-    return np.asarray(np.concatenate([values(arg).ravel() for arg in node.args])[np.asarray(node.value)])
+    return known(node)[1].reshape(node.shape)
 
 
 def is_all(node: Node, number: Any) -> bool:
@@ -69,10 +83,8 @@ def is_all(node: Node, number: Any) -> bool:
 
 def is_uniform(node: Node) -> bool:
     """Returns whether all elements are known to be equal."""
-    if node.op == "const":
-        array = np.asarray(node.value)
-        return array.size > 0 and bool((array == array.flat[0]).all())
-    return node.op == "gather" and node.value is not None and bool((node.value == node.value.flat[0]).all())
+    array = node.value
+    return array is not None and array.size > 0 and bool((array == array.flat[0]).all())
 
 
 def known(node: Node) -> tuple[np.ndarray, np.ndarray]:
@@ -94,27 +106,24 @@ def zeros(node: Node) -> np.ndarray:
 
 def is_direct(node: Node) -> bool:
     """Returns whether the positions of a gather are linear in the indices of a loop."""
-    return len(node.args) == 1 and node.value is not None and strides(node.value) is not None
+    return len(node.args) == 1 and node.value is not None and None not in steps(node.value)
 
 
-def strides(positions: np.ndarray) -> tuple[int, tuple[int, ...]] | None:
-    """Returns (first, steps) such that positions = first + sum_a steps_a i_a, or None if there are none."""
-    if positions.size == 0:
-        return 0, (0,) * positions.ndim
-    first = int(positions.flat[0])
-    steps = []
-    expected = np.array(first)
-    for axis, extent in enumerate(positions.shape):
-        corner = (0,) * axis + (1,) + (0,) * (positions.ndim - axis - 1)
-        steps.append(int(positions[corner]) - first if extent > 1 else 0)
-        expected = expected[..., None] + steps[-1] * np.arange(extent)
-    return (first, tuple(steps)) if np.array_equal(positions, expected) else None
+def steps(positions: np.ndarray) -> list[int | None]:
+    """Returns the step of the positions along each axis, or None where it is not the same everywhere."""
+    every = [np.diff(positions, axis=axis) for axis in range(positions.ndim)]
+    return [0 if not step.size else None if np.ptp(step) else int(step.flat[0]) for step in every]
 
 
 def owners(sources: Sequence[Node], positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the index of the source at every position in the sources laid end to end, and their first positions."""
     starts = np.cumsum([0, *(source.size for source in sources)])
     return np.searchsorted(starts, positions, side="right") - 1, starts
+
+
+def sources_of(node: Node) -> tuple[Sequence[Node], np.ndarray]:
+    """Returns the nodes that a node takes its elements from, laid end to end, and the elements' positions [size]."""
+    return (node.args, np.ravel(node.value)) if node.op == "gather" else ((node,), np.arange(node.size))
 
 
 def read_source(node: Node, positions: np.ndarray) -> tuple[Node, np.ndarray]:
@@ -137,3 +146,41 @@ def without_unused(sources: list[Node], positions: np.ndarray) -> tuple[list[Nod
             start += source.size
         moved[index] = kept[source] - starts[index]
     return list(kept), np.asarray(positions + moved[owner])
+
+
+def unrolls(op: str, args: tuple[Node, ...], shape: tuple[int, ...], *, finite: bool) -> bool:
+    """Returns whether an elementwise operation is written element by element.
+
+    Small ones are, so that moving their elements costs nothing and a compiler keeps them in registers.
+    """
+    size, functions = prod(shape), op in TRANSCENDENTAL and args[0].dtype == "real"
+    if size < (VECTOR_OF_FUNCTIONS if functions else VECTOR):
+        return shape != () and size > 0
+    if functions or size > _MOST_ZEROS:
+        return False
+    scattered = (arg for arg in args if arg.op == "gather" and not is_direct(arg))
+    if size <= UNROLL_LIMIT and any(size <= _MOST_SCALARS or _is_mixed(arg) for arg in scattered):
+        return True
+    if not finite or op not in _TRIVIAL:
+        return False
+    trivial = _TRIVIAL[op](*(np.broadcast_to(zeros(arg), size) for arg in args))
+    return bool(trivial.any()) and size - trivial.sum() <= UNROLL_LIMIT
+
+
+def _is_mixed(gather: Node) -> bool:
+    """Returns whether a gather reads arrays, which a loop cannot read without copying them."""
+    return any(arg.size > 1 or arg.op == "const" for arg in gather.args)
+
+
+def unrolls_product(a: Node, b: Node, *, finite: bool) -> bool:
+    """Returns whether a product of matrices [b, m, k] and [b, k, n] is written element by element.
+
+    Constants with several columns stay whole: other products with the same constant share its loop.
+    """
+    (batch, m, k), n = a.shape, b.shape[2]
+    if batch * m * k * n <= UNROLL_LIMIT and not (is_constant(b) and n >= VECTOR_OF_FUNCTIONS):
+        return True
+    if not finite or batch * m * n > _MOST_ZEROS:
+        return False
+    left, right = (~zeros(node).reshape(node.shape) for node in (a, b))
+    return not (left.all() and right.all()) and int(np.matmul(left.astype(int), right).sum()) <= UNROLL_LIMIT

@@ -6,55 +6,16 @@ shifts by at least the number of bits undefined. XLA defines them all (x / 0 is 
 0 is x; NaN becomes 0; all bits are shifted out), and so does this C.
 """
 
-import functools
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+from jax import lax
 
 from dln_jax.export.c.elementary import OPERATIONS as COSTS
 from dln_jax.export.c.elementary import VECTORISED as _VECTORISED
-from dln_jax.export.c.text import C_TYPES, NUMPY_TYPES, SIGNED, UNSIGNED, number
-
-
-def _quotient(a, b):
-    """Returns `a / b` for integer arrays, rounded towards zero."""
-    safe = np.where(b == 0, np.ones_like(b), b)
-    whole = a // safe
-    if a.dtype.kind == "i":
-        whole = whole + ((whole * safe != a) & ((a < 0) != (safe < 0)))
-    return np.where(b == 0, a.dtype.type(-1) if a.dtype.kind == "i" else np.iinfo(a.dtype).max, whole)
-
-
-def _remainder(a, b):
-    """Returns `a % b` for integer arrays, with the sign of a."""
-    safe = np.where((b == 0) | (b == -1), np.ones_like(b), b) if b.dtype.kind == "i" else np.where(b == 0, 1, b)
-    return np.where(b == 0, a, np.fmod(a, safe))
-
-
-def _converted(x, kind: str):
-    """Converts an array to a kind; real numbers are rounded towards zero and saturate."""
-    to = NUMPY_TYPES[kind]
-    if x.dtype.kind != "f":
-        return x.astype(to)
-    low, high = np.iinfo(to).min, np.iinfo(to).max
-    representable = (x > float(low)) & (x < float(high))
-    whole = np.where(representable, x, 0).astype(to)
-    return np.where(representable | (x != x), whole, np.where(x > 0, to(high), to(low)))
-
-
-def _shifted_right(a, b, *, kind: str):
-    """Returns `a >> b` for arrays, with zeros (kind "u") or copies of the sign bit (kind "i") shifted in.
-
-    NumPy shifts like XLA: a negative amount, or one of at least the number of bits, shifts all bits out.
-    """
-    typed = np.dtype(f"{kind}{a.dtype.itemsize}")
-    return np.right_shift(a.view(typed), b.view(typed)).view(a.dtype)
-
-
-def _bits(kind: str) -> Callable[..., Any]:
-    return lambda x: x.view(NUMPY_TYPES[kind])
+from dln_jax.export.c.text import C_TYPES, NUMPY_TYPES, SIGNED, UNSIGNED, limit, number
 
 
 class Operation(NamedTuple):
@@ -70,11 +31,42 @@ class Operation(NamedTuple):
     """Kind of the result; None for that of the arguments."""
     function: str | None = None
     """Function of <math.h> that it calls, if any."""
+    integer: str = ""
+    """C expression for integers and booleans of type {c}, with unsigned type {u}, if it differs."""
 
-    @property
-    def repeats_arguments(self) -> bool:
-        """Whether the C contains an argument twice, which must then be a variable."""
-        return any(self.c.count(f"{{{k}}}") > 1 for k in range(3))
+    def on(self, kind: str) -> str:
+        """Returns the C expression for arguments of a kind; an `index` cannot overflow, so nothing wraps."""
+        as_real = kind == "real" or (kind == "index" and "{u}" in self.integer)
+        return self.c if as_real else self.integer or self.c
+
+    def repeats_arguments(self, kind: str) -> bool:
+        """Returns whether the C contains an argument twice, which must then be a variable."""
+        return any(self.on(kind).count(f"{{{k}}}") > 1 for k in range(3))
+
+
+def _by_xla(name: str, real: Callable[..., Any] | None = None) -> Callable[..., Any]:
+    """Returns a function that folds integers as XLA does where NumPy differs, and real numbers by NumPy."""
+
+    def fold(*args: Any) -> Any:
+        if real is not None and args[0].dtype.kind == "f":
+            return real(*args)
+        return np.asarray(getattr(lax, name)(*np.broadcast_arrays(*args)))
+
+    return fold
+
+
+def _conversion(kind: str, c: str) -> Operation:
+    """Returns the conversion to an integer kind; real numbers are rounded towards zero and saturate."""
+    to = NUMPY_TYPES[kind]
+
+    def fold(x: Any) -> Any:
+        return np.asarray(lax.convert_element_type(x, to)) if x.dtype.kind == "f" else x.astype(to)
+
+    return Operation(f"elementary_{kind}_of({{0}})", fold, 0, kind, integer=f"(({c}){{0}})")
+
+
+def _bits(kind: str) -> Operation:
+    return Operation(f"(({C_TYPES[kind]})elementary_word_of({{0}}))", lambda x: x.view(NUMPY_TYPES[kind]), 0, kind)
 
 
 def _function(name: str, fold: Callable[..., Any] | None, *, arguments: int = 1) -> Operation:
@@ -83,7 +75,8 @@ def _function(name: str, fold: Callable[..., Any] | None, *, arguments: int = 1)
 
 
 def _comparison(symbol: str, fold: Callable[..., Any]) -> Operation:
-    return Operation(f"({{0}} {symbol} {{1}})", fold, 0, "bool")
+    # With a plus, because compilers warn about comparing truths, bits, and numbers with themselves.
+    return Operation(f"({{0}} {symbol} {{1}})", fold, 0, "bool", integer=f"(+{{0}} {symbol} +{{1}})")
 
 
 _AS_IN_NUMPY = (
@@ -92,19 +85,20 @@ _AS_IN_NUMPY = (
 )  # fmt: skip
 """Functions of <math.h> that have the same name in NumPy."""
 OPERATIONS = {
-    "add": Operation("({0} + {1})", np.add),
-    "sub": Operation("({0} - {1})", np.subtract),
-    "mul": Operation("({0} * {1})", np.multiply),
-    "multiply_add": Operation("MULTIPLY_ADD({0}, {1}, {2})", lambda a, b, c: a * b + c, 2),
-    "div": Operation("({0} / {1})", np.divide),
-    "integer_div": Operation("({0} / {1})", _quotient),
-    "neg": Operation("(-{0})", np.negative, 0),
-    "abs": Operation("fabs{f}({0})", np.abs, 0),
-    "integer_abs": Operation("({0} < 0 ? -{0} : {0})", np.abs, 0),
-    "max": Operation("(({0} > {1} || {0} != {0}) ? {0} : {1})", np.maximum, 0),
-    "min": Operation("(({0} < {1} || {0} != {0}) ? {0} : {1})", np.minimum, 0),
-    "integer_rem": Operation("({0} % {1})", _remainder, 0),
-    "rem": _function("fmod", np.fmod, arguments=2),
+    "add": Operation("({0} + {1})", np.add, integer="(({c})(({u}){0} + ({u}){1}))"),
+    "sub": Operation("({0} - {1})", np.subtract, integer="(({c})(({u}){0} - ({u}){1}))"),
+    "mul": Operation("({0} * {1})", np.multiply, integer="(({c})(({u}){0} * ({u}){1}))"),
+    "multiply_add": Operation(
+        "MULTIPLY_ADD({0}, {1}, {2})", lambda a, b, c: a * b + c, 2, integer="(({c})(({u}){2} + ({u}){0} * ({u}){1}))"
+    ),
+    "div": Operation("({0} / {1})", _by_xla("div", np.divide), integer="elementary_quotient_{kind}({0}, {1})"),
+    "rem": _function("fmod", _by_xla("rem", np.fmod), arguments=2)._replace(
+        integer="elementary_remainder_{kind}({0}, {1})"
+    ),
+    "neg": Operation("(-{0})", np.negative, 0, integer="(({c})(0 - ({u}){0}))"),
+    "abs": Operation("fabs{f}({0})", np.abs, 0, integer="({0} < 0 ? ({c})(0 - ({u}){0}) : {0})"),
+    "max": Operation("(({0} > {1} || {0} != {0}) ? {0} : {1})", np.maximum, 0, integer="(+{0} > +{1} ? {0} : {1})"),
+    "min": Operation("(({0} < {1} || {0} != {0}) ? {0} : {1})", np.minimum, 0, integer="(+{0} < +{1} ? {0} : {1})"),
     **{name: _function(name, getattr(np, name), arguments=2) for name in ("pow", "atan2", "nextafter")},
     **{name: _function(name, getattr(np, name)) for name in _AS_IN_NUMPY},
     **{name: _function(name, np.vectorize(getattr(math, name), otypes=[float])) for name in ("erf", "erfc")},
@@ -125,31 +119,21 @@ OPERATIONS = {
     "and": Operation("({0} & {1})", np.bitwise_and, 0),
     "or": Operation("({0} | {1})", np.bitwise_or, 0),
     "xor": Operation("({0} ^ {1})", np.bitwise_xor, 0),
-    "not": Operation("(!{0})", np.logical_not, 0),
-    "integer_not": Operation("(~{0})", np.invert, 0),
+    "not": Operation("(~{0})", np.invert, 0),
+    "logical_not": Operation("(!{0})", np.logical_not, 0),
     **{
-        f"shift_{name}": Operation(f"elementary_shift_{name}({{0}}, {{1}})", fold, 0)
-        for name, fold in {
-            "left": np.left_shift,
-            "right_logical": functools.partial(_shifted_right, kind="u"),
-            "right_arithmetic": functools.partial(_shifted_right, kind="i"),
-        }.items()
+        f"shift_{name}": Operation(f"elementary_shift_{name}_{{kind}}({{0}}, {{1}})", _by_xla(f"shift_{name}"), 0)
+        for name in ("left", "right_logical", "right_arithmetic")
     },
     "select": Operation("({0} ? {1} : {2})", lambda c, a, b: np.where(c, a, b), 0),
-    **{
-        f"to_{kind}": Operation(f"(({C_TYPES[kind]}){{0}})", functools.partial(_converted, kind=kind), 0, kind)
-        for kind in NUMPY_TYPES
-    },
-    # Bits of a number as a word of its size, and back.
-    **{
-        f"{kind}_word_of": Operation(f"(({C_TYPES[kind]})elementary_word_of({{0}}))", _bits(kind), 0, kind)
-        for kind in UNSIGNED
-    },
-    "number_of": Operation("elementary_number_of({0})", lambda x: x.view(f"f{x.itemsize}"), 0, "real"),
+    **{f"to_{kind}": _conversion(kind, C_TYPES[kind]) for kind in NUMPY_TYPES},
     "to_real": Operation("((real){0})", lambda x: x, 0, "real"),
-    "to_bool": Operation("({0} != 0)", lambda x: x != 0, 0, "bool"),
+    "to_bool": Operation("({0} != 0)", lambda x: x != 0, 0, "bool", integer="(+{0} != 0)"),
+    # Bits of a number as a word of its size, and back.
+    **{f"{kind}_word_of": _bits(kind) for kind in UNSIGNED},
+    "number_of": Operation("elementary_number_of({0})", lambda x: x.view(f"f{x.itemsize}"), 0, "real"),
 }
-"""Operations by name."""
+"""Operations by name, which is that of JAX's primitive if there is one."""
 
 
 def total(operations: Mapping[str, int]) -> int:
@@ -163,65 +147,27 @@ TRANSCENDENTAL = frozenset(name for name, operation in OPERATIONS.items() if ope
 """Operations that call a function of <math.h>, except sqrt."""
 VECTORISED = frozenset(_VECTORISED)
 """Operations whose C vectorises in loops."""
-BY_BITS = {
-    "rounded": "rounded", "lt_to": "ordered", "le_to": "ordered", "number_of": "choice",
-    **{f"{kind}_word_of": "choice" for kind in UNSIGNED},
-}  # fmt: skip
-"""The part of the elementary functions that an operation on the bits of numbers needs."""
-_ON_BOOL = {"add": "or", "mul": "and", "max": "or", "min": "and", "ne": "xor"}
+_NEUTRAL = {"add": 0, "sub": 0, "mul": 1, "div": 1, "or": 0, "xor": 0}
+_ON_BOOL = {"add": "or", "mul": "and", "max": "or", "min": "and", "ne": "xor", "not": "logical_not"}
 
 
 def on_kind(op: str, kind: str) -> str:
-    """Returns the name of an operation for a kind; some differ for integers and booleans."""
-    if kind == "bool":
-        return _ON_BOOL.get(op, op)
-    return f"integer_{op}" if kind != "real" and f"integer_{op}" in OPERATIONS else op
+    """Returns the name of an operation for a kind; some differ for booleans, and the total order is of real numbers."""
+    op = op if kind == "real" else op.removesuffix("_to")
+    return _ON_BOOL.get(op, op) if kind == "bool" else op
 
 
-_WRAPPED = {
-    "add": "({c})(({u}){{0}} + ({u}){{1}})",
-    "sub": "({c})(({u}){{0}} - ({u}){{1}})",
-    "mul": "({c})(({u}){{0}} * ({u}){{1}})",
-    "neg": "({c})(0 - ({u}){{0}})",
-    "integer_abs": "({{0}} < 0 ? ({c})(0 - ({u}){{0}}) : {{0}})",
-}
-# With a plus, because compilers warn about comparing bits, some of them constant, with a number that they never equal.
-_ON_INTEGERS = {
-    "max": "({0} > {1} ? {0} : {1})", "min": "({0} < {1} ? {0} : {1})", "and": "(+({0} & {1}))", "or": "(+({0} | {1}))",
-}  # fmt: skip
-_ON_UNSIGNED = {"neg": "(0 - {0})", "integer_abs": "{0}"}
+def neutral(op: str, kind: str) -> Any:
+    """Returns the number that leaves the other argument of an operation unchanged, or None if there is none."""
+    if op in ("max", "min"):
+        return limit(kind, upper=op == "min")
+    return ~NUMPY_TYPES[kind](0) if op == "and" else _NEUTRAL.get(op)
 
 
-def _pattern(op: str, kind: str) -> str:
-    """Returns the C of an operation on arguments {0}, {1}, ... of a kind."""
-    if kind in SIGNED and op in _WRAPPED:
-        return f"({_WRAPPED[op].format(c=C_TYPES[kind], u='u' + C_TYPES[kind])})"
-    special = {} if kind == "real" else _ON_INTEGERS | (_ON_UNSIGNED if kind in UNSIGNED else {})
-    return special.get(op, OPERATIONS[op].c)
-
-
-def expression(op: str, dtype: str, *args: str, suffix: str = "") -> str:
+def expression(op: str, kind: str, *args: str, suffix: str = "") -> str:
     """Returns the C of an operation on numbers of a kind; `suffix` ends the names of functions of <math.h>."""
-    alike = len(args) == 2 and args[0] == args[1]  # compilers warn about comparing a number with itself
-    if alike and (op in ("lt", "gt") or (dtype != "real" and op in ("eq", "ne", "le", "ge"))):
-        return str(int(op in ("eq", "le", "ge")))
-    if alike and op in ("max", "min"):
-        return args[0]
-    if dtype in UNSIGNED and (known := _beside_zero(op, args)):
-        return known
-    return _pattern(op, dtype).format(*args, f=suffix)
-
-
-def _beside_zero(op: str, args: Sequence[str]) -> str | None:
-    """Returns C that compares an unsigned number with a literal 0 without compiler warnings, or None."""
-    zeros = ("0U", "0ULL")
-    if op in ("max", "min") and not {*zeros}.isdisjoint(args):
-        other = args[0] if args[1] in zeros else args[1]
-        return other if op == "max" else f"({other} & 0U)"
-    if op in ("lt", "ge", "gt", "le"):
-        other, zero = args if op in ("lt", "ge") else args[::-1]
-        return f"(({other} == 0U) {'|' if op in ('ge', 'le') else '&'} ({other} > 0U))" if zero in zeros else None
-    return None
+    c = C_TYPES[kind]
+    return OPERATIONS[op].on(kind).format(*args, f=suffix, kind=kind, c=c, u=f"u{c.removeprefix('u')}")
 
 
 _GUARDED = {

@@ -4,18 +4,20 @@ Small arrays are unrolled into scalars, so that moving elements costs nothing an
 Others become loops over arrays; an elementwise operation with one reader is fused into its reader's loop.
 """
 
+from collections import Counter
 from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
-from dln_jax.export.c.nodes import Loop, Node, Region, is_direct
+from dln_jax.export.c.nodes import UNROLL_LIMIT, Loop, Node, Region, is_direct
 from dln_jax.export.c.operations import OPERATIONS, VECTORISED
 from dln_jax.export.c.program import Program
-from dln_jax.export.c.simplify import UNROLL_LIMIT
 
 _DEPTH = 16
 """Largest depth of a scalar expression; compilers limit the nesting of parentheses."""
+_GIVEN = ("input", "const", "carry", "counter", "project")
+"""Operations whose values are there when a region begins, or when the loop that they name has ended."""
 _FACTORED = ("cholesky", "triangular_solve", "permutation", "geqrf", "householder_product", "eigh")
 PLAIN_MEMORY = ("take", "order", "lu", "call", *_FACTORED)
 """Operations that read arguments through a pointer."""
@@ -32,14 +34,14 @@ class Plan(NamedTuple):
     """Nodes that are stored in an array; others are scalars."""
     root: dict[Node, Node]
     """Last node of the loop that computes an elementwise node."""
-    needed: dict[Node, np.ndarray]
-    """Which elements of every node are read."""
+    nodes: set[Node]
+    """Nodes with elements that the results need."""
     levels: dict[Node, int]
     """Length of the longest chain of products before a node."""
     reads: dict[Node | None, set[Node]]
     """Arrays of its region that a step reads; a loop reads the arrays that its body reads, and None the results."""
-    readers: dict[Node, set[Node | None]]
-    """Steps that read an array."""
+    readers: Counter[Node]
+    """Number of steps that read an array."""
     beside: dict[Node, Node]
     """Pairs of a sine and a cosine of the same scalar, in both directions."""
 
@@ -47,7 +49,8 @@ class Plan(NamedTuple):
 def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     """Returns the plan for a program with these results."""
     results = list(results)
-    nodes, readers, whole, contiguous = _reached(program, results)
+    nodes = needed_by(program, results)
+    readers, whole, contiguous = _readers(program, results, nodes)
     unrolled = {node for node in nodes if _is_unrolled(node)}
     arrays, followed = set(contiguous), set()
     # Loops read arrays. A gather that a loop cannot index linearly is first copied to an array.
@@ -65,19 +68,15 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     arrays = {node for node in arrays if node.op not in ("input", "const")}
     root: dict[Node, Node] = _fused(nodes, readers, whole | set(results), unrolled, arrays)
     arrays -= {node for node, into in root.items() if into is not node}
-    levels, needed = _levels(nodes), _needed(program, nodes, unrolled, arrays, results)
-    order: dict[Region, list[Node]] = {}
-    in_order = sorted(nodes, key=lambda node: (levels[node], node in unrolled or node.op != "dot_general", node.number))
-    for node in in_order:
-        ends = root.get(node, node)
-        if needed[ends].any() and ends is node:
+    levels, order = _levels(nodes), {}
+    used = [node for node in nodes if node.size]
+    for node in sorted(used, key=lambda node: (levels[node], node.op != "dot_general")):
+        written = node in arrays if node.op == "gather" else node.op not in _GIVEN
+        if written and root.get(node, node) is node:
             order.setdefault(node.region, []).append(node)
     reads = _reads(program, nodes, arrays, root, results)
-    steps: dict[Node, set[Node | None]] = {}
-    for step, read in reads.items():
-        for source in read:
-            steps.setdefault(source, set()).add(step)
-    return Plan(order, unrolled, arrays, root, needed, levels, reads, steps, _sines(unrolled - arrays))
+    left = Counter(source for read in reads.values() for source in read)
+    return Plan(order, unrolled, arrays, root, set(used), levels, reads, left, _sines(unrolled - arrays))
 
 
 def _sines(scalars: set[Node]) -> dict[Node, Node]:
@@ -95,17 +94,25 @@ def _bodies(program: Program, node: Node) -> list[Loop]:
     return [program.loops[number] for number in _numbers(node)]
 
 
-def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[Node, list[Node]], set[Node], set[Node]]:
-    """Returns the needed nodes in order, their readers, the nodes read whole, and those read by pointer."""
-    reached, waiting = set(), list(results)
+def needed_by(program: Program, results: Iterable[Node]) -> list[Node]:
+    """Returns all nodes that the results need in order, those in the bodies of loops and branches too."""
+    reached, waiting = set(), [node for node in results if node.size]
     while waiting:
         node = waiting.pop()
         if node not in reached:
             reached.add(node)
             waiting += node.args
             for loop in _bodies(program, node):
-                waiting += [*loop.carries, *loop.conditions, *loop.results]
-    nodes = sorted(reached, key=lambda node: node.number)
+                waiting += [*loop.carries, *loop.conditions, *loop.results[: len(loop.carries)]]
+            if node.op == "project":
+                waiting += [loop.results[node.attribute] for loop in _bodies(program, node.args[0])]
+    return sorted(reached, key=lambda node: node.number)
+
+
+def _readers(
+    program: Program, results: list[Node], nodes: list[Node]
+) -> tuple[dict[Node, list[Node]], set[Node], set[Node]]:
+    """Returns the readers of every node, the nodes read whole, and those read by pointer."""
     readers: dict[Node, list[Node]] = {node: [] for node in nodes}
     whole, contiguous = {node for node in results if node.size > UNROLL_LIMIT}, set()
     for node in nodes:
@@ -115,7 +122,7 @@ def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[No
             contiguous |= set(node.args[:1] if node.op == "take" else node.args)
         for loop in _bodies(program, node):
             whole |= {*loop.results, *loop.conditions, *node.args}
-    return nodes, readers, whole, contiguous
+    return readers, whole, contiguous
 
 
 def _is_unrolled(node: Node) -> bool:
@@ -150,7 +157,7 @@ def _fused(nodes: list[Node], readers: dict[Node, list[Node]], whole, unrolled, 
 def _is_read_again(node: Node, readers: list[Node]) -> bool:
     """Returns whether a scalar occurs more than once in the C of its readers."""
     if len(readers) > 1 or readers[0].op != "gather":
-        return len(readers) > 1 or OPERATIONS[readers[0].op].repeats_arguments
+        return len(readers) > 1 or OPERATIONS[readers[0].op].repeats_arguments(node.dtype)
     start = sum(arg.size for arg in readers[0].args[: readers[0].args.index(node)])
     return bool((np.asarray(readers[0].value) == start).sum() > 1)
 
@@ -189,34 +196,3 @@ def _reads(program: Program, nodes, arrays, root, results) -> dict[Node | None, 
                 step = loops[node.region[depth]] if len(node.region) > depth else root.get(node, node)
                 reads.setdefault(step, set()).add(source)
     return reads
-
-
-def _needed(program: Program, nodes, unrolled, arrays, results) -> dict[Node, np.ndarray]:
-    """Returns which elements of every node are read."""
-    needed = {node: np.zeros(node.size, bool) for node in nodes}
-    projected: dict[Node, set[int]] = {}
-    for node in results:
-        needed[node][:] = True
-    for node in reversed(nodes):
-        mask = needed[node]
-        if not mask.any():
-            continue
-        if node in arrays:
-            mask[:] = True
-        for loop in _bodies(program, node):
-            for k, result in enumerate(loop.results):
-                if k < len(loop.carries) or k in projected.get(node, ()):
-                    needed[result][:] = True
-            for result in (*loop.conditions, *loop.carries):
-                needed[result][:] = True
-        if node.op == "project":
-            projected.setdefault(node.args[0], set()).add(node.attribute)
-        if node.op == "gather":
-            starts = np.cumsum([0, *(arg.size for arg in node.args)])
-            positions = np.asarray(node.value).ravel()[mask]
-            for arg, start in zip(node.args, starts, strict=False):
-                needed[arg][positions[(positions >= start) & (positions < start + arg.size)] - start] = True
-        else:
-            for arg in node.args:
-                needed[arg][:] = True
-    return needed

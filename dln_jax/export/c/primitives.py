@@ -1,31 +1,29 @@
-"""Rules that lower JAX's elementwise and shape primitives, products and reductions to nodes of a program.
+"""Rules that lower JAX's primitives to nodes of a program, except indexing and control flow.
+
+Primitives with an operation of the same name in `operations.OPERATIONS` need no rule.
 
 A rule takes the program, the equation's arguments and, by keyword, the parameters that it reads, and returns one or
 several results. Two more keywords are `results`, the abstract values of the results, and `kind`, that of the first.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import accumulate
 from math import prod
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from dln_jax.export.c.nodes import Node, zeros
-from dln_jax.export.c.operations import on_kind
+from dln_jax.export.c.nodes import UNROLL_LIMIT, Node, zeros
+from dln_jax.export.c.operations import neutral, on_kind
 from dln_jax.export.c.program import Program
-from dln_jax.export.c.simplify import UNROLL_LIMIT, neutral
-from dln_jax.export.c.text import NUMPY_TYPES, UNSIGNED
+from dln_jax.export.c.text import NUMPY_TYPES
 from dln_jax.types import InputError
 
 Rule = Callable[..., Any]
-_AS_NAMED = (
-    "add", "sub", "mul", "div", "rem", "max", "min", "neg", "abs", "not", "and", "or", "xor", "atan2", "sqrt", "cbrt",
-    "exp", "exp2", "expm1", "log", "log1p", "log2", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh",
-    "asinh", "acosh", "atanh", "erf", "erfc", "lgamma", "floor", "ceil", "is_finite", "nextafter", "shift_left",
-    "shift_right_logical", "shift_right_arithmetic",
-)  # fmt: skip
 
 
 def convert(program: Program, node: Node, kind: str) -> Node:
@@ -33,15 +31,19 @@ def convert(program: Program, node: Node, kind: str) -> Node:
     return node if node.dtype == kind else program.elementwise(f"to_{kind}", node)
 
 
-def rows_of(program: Program, node: Node, axes: tuple[int, ...]) -> Node:
+def grouped(program: Program, node: Node, *groups: Sequence[int]) -> Node:
+    """Returns the node with its axes transposed, and each group of axes flattened to one."""
+    index = np.arange(node.size).reshape(node.shape).transpose([axis for group in groups for axis in group])
+    return program.gather([node], index.reshape([prod(node.shape[axis] for axis in group) for group in groups]))
+
+
+def rows_of(program: Program, node: Node, axes: Sequence[int]) -> Node:
     """Returns the node as a matrix [o, r] whose columns are the elements along `axes`."""
-    kept = [axis for axis in range(len(node.shape)) if axis not in axes]
-    index = np.arange(node.size).reshape(node.shape).transpose([*kept, *axes])
-    return program.gather([node], index.reshape(prod(node.shape[axis] for axis in kept), -1))
+    return grouped(program, node, _others(node, axes), axes)
 
 
-def _elementwise(name: str) -> Rule:
-    return lambda program, *args: program.elementwise(name, *args)
+def _others(node: Node, axes: Sequence[int]) -> list[int]:
+    return [axis for axis in range(len(node.shape)) if axis not in axes]
 
 
 def _moved(move: Callable[..., Any]) -> Rule:
@@ -55,23 +57,19 @@ def _moved(move: Callable[..., Any]) -> Rule:
         starts = np.cumsum([0, *(node.size for node in nodes)])
         indices = [np.arange(node.size).reshape(node.shape) + k for node, k in zip(nodes, starts, strict=False)]
         moved = move(*indices, **parameters)
-        if isinstance(moved, list):
-            return [program.gather(nodes, positions) for positions in moved]
-        return program.gather(nodes, moved)
+        return [program.gather(nodes, positions) for positions in (moved if isinstance(moved, list) else [moved])]
 
     return rule
 
 
 def _broadcast_in_dim(index, *, shape, broadcast_dimensions):
-    expanded = [1] * len(shape)
-    for axis, size in zip(broadcast_dimensions, index.shape, strict=True):
-        expanded[axis] = size
-    return np.broadcast_to(index.reshape(expanded), shape)
+    added = tuple(axis for axis in range(len(shape)) if axis not in broadcast_dimensions)
+    return np.broadcast_to(np.expand_dims(index, added), shape)
 
 
 def _slice(index, *, start_indices, limit_indices, strides):
-    limits = zip(start_indices, limit_indices, strides or [1] * index.ndim, strict=True)
-    return index[tuple(slice(int(start), int(limit), int(stride)) for start, limit, stride in limits)]
+    steps = strides or [1] * index.ndim
+    return index[tuple(map(slice, start_indices, limit_indices, steps))]
 
 
 def _pad(index, padding, *, padding_config):
@@ -84,80 +82,47 @@ def _pad(index, padding, *, padding_config):
     return index
 
 
-def _split(index, *, sizes, axis):
-    return list(np.split(index, np.cumsum(sizes)[:-1], axis=axis))
-
-
-def _comparison(name: str) -> Rule:
-    """Returns the rule of a comparison; booleans use logic, because compilers warn about comparing them."""
-
-    def rule(program: Program, a: Node, b: Node) -> Node:
-        if a.dtype != "bool" or name == "ne":
-            return program.elementwise(name, a, b)
-        if name == "eq":
-            return program.elementwise("not", program.elementwise("xor", a, b))
-        # a < b is (not a) and b; a <= b is (not a) or b
-        low, high = (a, b) if name in ("lt", "le") else (b, a)
-        return program.elementwise("and" if name in ("lt", "gt") else "or", program.elementwise("not", low), high)
-
-    return rule
-
-
-def _total_order(name: str) -> Rule:
-    """Returns the rule of a comparison in the total order of IEEE 754; other kinds are compared as usual."""
-    usual = _comparison(name)
-
-    def rule(program: Program, a: Node, b: Node) -> Node:
-        return program.elementwise(f"{name}_to", a, b) if a.dtype == "real" else usual(program, a, b)
-
-    return rule
-
-
 def _power(program: Program, x: Node, exponent: Node, *, kind: str) -> Node:
     return program.elementwise("pow", *(convert(program, node, kind) for node in (x, exponent)))
 
 
-def _integer_power(program: Program, x: Node, *, y: int) -> Node:
-    result, power, left = None, x, abs(y)
+def composed(program: Program, function: Callable[..., Any], nodes: Sequence[Node]) -> list[Node]:
+    """Returns the results of a JAX function."""
+    types = [program.real if node.dtype == "real" else NUMPY_TYPES[node.dtype] for node in nodes]
+    examples = [jax.ShapeDtypeStruct(node.shape, dtype) for node, dtype in zip(nodes, types, strict=True)]
+    return program.inline(program, jax.make_jaxpr(function)(*examples), nodes)
+
+
+def _composed(function: Callable[..., Any]) -> Rule:
+    """Returns the rule of a primitive that a JAX function of the same arguments composes of others."""
+
+    @functools.wraps(function)
+    def rule(program: Program, *nodes: Node, **parameters: Any) -> list[Node]:
+        return composed(program, functools.partial(function, **parameters), nodes)
+
+    return rule
+
+
+def _integer_power(x, *, y):
+    result, power, left = jnp.ones_like(x), x, abs(y)
     while left:
-        if left & 1:
-            result = power if result is None else program.elementwise("mul", result, power)
+        result = result * power if left & 1 else result
         left >>= 1
-        power = program.elementwise("mul", power, power) if left else power
-    one = program.constant(1, x.dtype)
-    if result is None:
-        return program.broadcast(one, x.shape)
-    return result if y > 0 else program.elementwise("div", one, result)
+        power = power * power if left else power
+    return result if y >= 0 else 1 / result
 
 
-def _sign(program: Program, x: Node) -> Node:
-    if x.dtype in UNSIGNED:
-        return program.elementwise("min", x, 1)
-    minus, one = (program.constant(number, x.dtype) for number in (-1, 1))
-    positive, negative = (program.elementwise(name, x, 0) for name in ("gt", "lt"))
-    # 0 and NaN are returned as they are.
-    return program.select(positive, program.select(negative, x, minus), one)
-
-
-def _logistic(program: Program, x: Node) -> Node:
-    decay = program.elementwise("exp", program.elementwise("neg", x))
-    return program.elementwise("div", 1, program.elementwise("add", 1, decay))
-
-
-def _one_minus_square(program: Program, x: Node) -> Node:
-    return program.elementwise("mul", program.elementwise("sub", 1, x), program.elementwise("add", 1, x))
-
-
-def _clamp(program: Program, low: Node, x: Node, high: Node) -> Node:
-    return program.elementwise("min", program.elementwise("max", x, low), high)
+def _sign(x):
+    one = jnp.ones_like(x)
+    return jnp.where(x > 0, one, jnp.where(x < 0, -one, x))  # 0 and NaN are returned as they are
 
 
 def _select_n(program: Program, which: Node, *cases: Node) -> Node:
     if which.dtype == "bool":
-        return program.select(which, *cases)
-    result = cases[-1]
-    for number, case in reversed(list(enumerate(cases[:-1]))):
-        result = program.select(program.elementwise("eq", which, number), result, case)
+        return program.elementwise("select", which, *reversed(cases))
+    *others, result = cases
+    for number, case in enumerate(others):
+        result = program.elementwise("select", program.elementwise("eq", which, number), case, result)
     return result
 
 
@@ -175,10 +140,6 @@ def _empty(program: Program, *, kind: str, shape: tuple[int, ...] = ()) -> Node:
     return program.constant(np.zeros(shape), kind)
 
 
-def _iota(program: Program, *, shape, dimension: int, kind: str) -> Node:
-    return program.constant(np.indices(shape)[dimension], kind)
-
-
 def _reduce_precision(program: Program, x: Node, *, exponent_bits: int, mantissa_bits: int) -> Node:
     own = np.finfo(program.real)
     if exponent_bits >= own.nexp and mantissa_bits >= own.nmant:
@@ -189,18 +150,15 @@ def _reduce_precision(program: Program, x: Node, *, exponent_bits: int, mantissa
 def _dot_general(program: Program, a: Node, b: Node, *, dimension_numbers, precision: Any, kind: str) -> Node:
     if isinstance(precision, lax.DotAlgorithm | lax.DotAlgorithmPreset):  # it may round operands and sums
         raise InputError(f"the primitive 'dot_general' has no C with precision={precision}")
-    a, b = (convert(program, node, kind) for node in (a, b))
+    counted = "int" if kind == "bool" else kind
+    a, b = (convert(program, node, counted) for node in (a, b))
     (a_sum, b_sum), (a_batch, b_batch) = dimension_numbers
-    a_free = [axis for axis in range(len(a.shape)) if axis not in (*a_sum, *a_batch)]
-    b_free = [axis for axis in range(len(b.shape)) if axis not in (*b_sum, *b_batch)]
-
-    def ordered(node: Node, *groups) -> Node:
-        index = np.arange(node.size).reshape(node.shape).transpose([axis for group in groups for axis in group])
-        return program.gather([node], index.reshape([prod(node.shape[axis] for axis in group) for group in groups]))
-
-    product = program.dot_general(ordered(a, a_batch, a_free, a_sum), ordered(b, b_batch, b_sum, b_free))
+    a_free, b_free = _others(a, (*a_sum, *a_batch)), _others(b, (*b_sum, *b_batch))
+    product = program.dot_general(
+        grouped(program, a, a_batch, a_free, a_sum), grouped(program, b, b_batch, b_sum, b_free)
+    )
     shape = [a.shape[axis] for axis in (*a_batch, *a_free)] + [b.shape[axis] for axis in b_free]
-    return program.reshape(product, shape)
+    return convert(program, program.reshape(product, shape), kind)
 
 
 def _reduction(name: str) -> Rule:
@@ -219,61 +177,131 @@ def _reduction(name: str) -> Rule:
     return rule
 
 
-def _arg(name: str) -> Rule:
-    def rule(program: Program, node: Node, *, axes, kind: str) -> Node:
-        (axis,) = map(int, axes)
-        rows = rows_of(program, node, (axis,))
-        made = program.make(name, rows.shape[:1], kind, [rows])
-        return program.reshape(made, node.shape[:axis] + node.shape[axis + 1 :])
+def _place_of(best: Callable[..., Any]) -> Rule:
+    """Returns the rule of the first place of a row's largest or smallest element, or of its first NaN."""
 
-    return rule
+    def place(x, *, axes, index_dtype):
+        (axis,) = axes
+        chosen = (x == best(x, axis=axis, keepdims=True)) | (x != x)
+        places = lax.broadcasted_iota(index_dtype, x.shape, axis)
+        return jnp.where(chosen, places, x.shape[axis]).min(axis)
+
+    return _composed(place)
 
 
-def _cumulative(op: str) -> Rule:
+def _cumulative(combine: Callable[..., Any]) -> Rule:
     """Returns the rule of a cumulative operation, unrolled along the axis."""
 
-    def rule(program: Program, node: Node, *, axis: int, reverse: bool) -> Node:
-        index = np.moveaxis(np.arange(node.size).reshape(node.shape), axis, 0)
-        index = index[::-1] if reverse else index
-        pieces: list[Node] = []
-        for positions in index:
-            piece = program.gather([node], positions)
-            pieces.append(program.elementwise(op, pieces[-1], piece) if pieces else piece)
-        if reverse:
-            pieces.reverse()
-        joined = np.arange(node.size).reshape(index.shape)
-        return program.gather(pieces, np.moveaxis(joined, 0, axis)) if pieces else node
+    def totals(x, *, axis, reverse):
+        order = slice(None, None, -1 if reverse else 1)
+        return jnp.stack([*accumulate(jnp.unstack(x, axis=axis)[order], combine)][order], axis)
 
-    return rule
+    return _composed(totals)
+
+
+def _items(program: Program, node: Node, rank: int = 2) -> list[Node]:
+    """Returns the matrices of a batch (vectors for rank 1)."""
+    if not node.size:
+        raise InputError(f"factorisations have C of arrays with elements; this one has shape {node.shape}")
+    index = np.arange(node.size).reshape(-1, *node.shape[len(node.shape) - rank :])
+    return [program.gather([node], positions) for positions in index]
+
+
+def _applied(
+    program: Program, op: str, *arrays: Node, shapes: Sequence[Sequence[int]], ranks: Sequence[int] = (2, 2),
+    kind: str = "real", attribute: Any = None,
+) -> list[Node]:  # fmt: skip
+    """Applies an operation to every item of a batch; the results of one item lie end to end."""
+    batch, sizes = arrays[0].shape[: len(arrays[0].shape) - ranks[0]], [prod(shape) for shape in shapes]
+    items = zip(*(_items(program, array, rank) for array, rank in zip(arrays, ranks, strict=False)), strict=True)
+    nodes = [program.make(op, (sum(sizes),), kind, item, attribute) for item in items]
+    firsts = np.arange(len(nodes))[:, None] * sum(sizes)
+    parts = np.split(firsts + np.arange(sum(sizes)), np.cumsum(sizes)[:-1], axis=1)
+    return [program.gather(nodes, part.reshape(*batch, *shape)) for part, shape in zip(parts, shapes, strict=True)]
+
+
+def _triangular_solve(
+    program: Program, a: Node, b: Node, *, left_side: bool, lower: bool, transpose_a: bool, unit_diagonal: bool
+) -> Node:
+    if not left_side:  # X A = B is A^T X^T = B^T
+        transpose_a, b = not transpose_a, program.transpose(b)
+    if transpose_a:
+        a, lower = program.transpose(a), not lower
+    attribute = (bool(lower), bool(unit_diagonal))
+    (x,) = _applied(program, "triangular_solve", a, b, shapes=[b.shape[-2:]], attribute=attribute)
+    return x if left_side else program.transpose(x)
+
+
+def _lu(program: Program, a: Node) -> list[Node]:
+    *batch, rows, columns = a.shape
+    nodes = [program.make("lu", (), "int", [matrix]) for matrix in _items(program, a)]
+    results = []
+    for place, shape in enumerate([(rows, columns), (min(rows, columns),), (rows,)]):
+        parts = [program.make("project", shape, "int" if place else "real", [node], place) for node in nodes]
+        results.append(program.gather(parts, np.arange(len(parts) * prod(shape)).reshape(*batch, *shape)))
+    return results
+
+
+def _geqrf(program: Program, a: Node) -> list[Node]:
+    return _applied(program, "geqrf", a, shapes=[a.shape[-2:], (min(a.shape[-2:]),)])
+
+
+def _with_columns(a, count):
+    """Returns matrices with columns of zeros appended up to a count."""
+    return jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, max(count - a.shape[-1], 0))])
+
+
+def _ormqr(a, tau, c, *, left, transpose):
+    """Multiplies by the whole orthogonal matrix of reflectors."""
+    q = lax.linalg.householder_product(_with_columns(a, a.shape[-2]), tau)
+    q = q.mT if transpose else q
+    return q @ c if left else c @ q
+
+
+def _q_and_r(packed, tau, *, full_matrices):
+    m, n = packed.shape[-2:]
+    rows = m if full_matrices else min(m, n)
+    q = lax.linalg.householder_product(_with_columns(packed, rows)[..., :rows], tau)
+    return q, jnp.triu(packed[..., :rows, :])
+
+
+def _qr(program: Program, a: Node, *, full_matrices: bool) -> list[Node]:
+    return _composed(_q_and_r)(program, *_geqrf(program, a), full_matrices=full_matrices)
+
+
+def _eigh(program: Program, a: Node, *, lower: bool, subset_by_index) -> list[Node]:
+    """Applies `eigh` to the lower or upper triangle; the signs of eigenvectors may differ from LAPACK's."""
+    n = a.shape[-1]
+    if subset_by_index not in (None, (0, n)):
+        raise InputError("the primitive 'eigh' has C for all eigenvalues; got subset_by_index")
+    row, column = np.sort(np.indices((n, n)), axis=0)[:: -1 if lower else 1]
+    symmetric = program.gather([a], np.arange(a.size).reshape(a.shape)[..., row, column])
+    return _applied(program, "eigh", symmetric, shapes=[(n, n), (n,)])
 
 
 _OF_REDUCTIONS = {"sum": "add", "prod": "mul", "max": "max", "min": "min", "and": "and", "or": "or", "xor": "xor"}
 RULES: dict[str, Rule] = {
-    **{name: _elementwise(name) for name in _AS_NAMED},
-    "add_any": _elementwise("add"),
-    **dict.fromkeys(("stop_gradient", "copy", "copy_p", "device_put", "optimization_barrier"), lambda _, *nodes: nodes),
-    "square": lambda program, x: program.elementwise("mul", x, x),
-    **{name: _comparison(name) for name in ("eq", "ne", "lt", "le", "gt", "ge")},
-    **{f"{name}_to": _total_order(name) for name in ("lt", "le")},
+    **dict.fromkeys(("stop_gradient", "copy", "device_put", "optimization_barrier"), lambda _, *nodes: nodes),
+    "add_any": lambda program, a, b: program.elementwise("add", a, b),
+    "square": _composed(lambda x: x * x),
     "reduce_precision": _reduce_precision,
-    "sign": _sign,
-    "rsqrt": lambda program, x: program.elementwise("div", 1, program.elementwise("sqrt", x)),
+    "sign": _composed(_sign),
+    "rsqrt": _composed(lambda x: 1 / jnp.sqrt(x)),
     "pow": _power,
-    "integer_pow": _integer_power,
-    "logistic": _logistic,
-    "one_minus_square": _one_minus_square,
-    "clamp": _clamp,
+    "integer_pow": _composed(_integer_power),
+    "logistic": _composed(lambda x: 1 / (1 + jnp.exp(-x))),
+    "one_minus_square": _composed(lambda x: (1 - x) * (1 + x)),
+    "clamp": _composed(lambda low, x, high: jnp.minimum(jnp.maximum(x, low), high)),
     "round": lambda program, x, *, rounding_method: program.elementwise("rint" if int(rounding_method) else "round", x),
     "select_n": _select_n,
     "convert_element_type": lambda program, x, *, kind: convert(program, x, kind),
-    "iota": _iota,
+    "iota": lambda program, *, shape, dimension, kind: program.constant(np.indices(shape)[dimension], kind),
     "empty": _empty,
     "empty2": _empty,
     "bitcast_convert_type": _bits,
     "broadcast_in_dim": _moved(_broadcast_in_dim),
     "reshape": _moved(lambda index, *, new_sizes: index.reshape(new_sizes)),
     "squeeze": _moved(lambda index, *, dimensions: np.squeeze(index, tuple(dimensions))),
-    "expand_dims": _moved(lambda index, *, dimensions: np.expand_dims(index, tuple(dimensions))),
     "transpose": _moved(lambda index, *, permutation: index.transpose(permutation)),
     "rev": _moved(lambda index, *, dimensions: np.flip(index, dimensions)),
     "slice": _moved(_slice),
@@ -282,10 +310,27 @@ RULES: dict[str, Rule] = {
     "concatenate": _moved(lambda *indices, dimension: np.concatenate(indices, axis=dimension)),
     "stack": _moved(lambda *indices, axis: np.stack(indices, axis)),
     "unstack": _moved(lambda index, *, axis: list(np.moveaxis(index, axis, 0))),
-    "split": _moved(_split),
+    "split": _moved(lambda index, *, sizes, axis: list(np.split(index, np.cumsum(sizes)[:-1], axis=axis))),
     "dot_general": _dot_general,
     **{f"reduce_{name}": _reduction(op) for name, op in _OF_REDUCTIONS.items()},
-    **{name: _arg(name) for name in ("argmax", "argmin")},
-    **{f"cum{name}": _cumulative(_OF_REDUCTIONS[name]) for name in ("sum", "prod", "max", "min")},
+    "argmax": _place_of(jnp.max),
+    "argmin": _place_of(jnp.min),
+    "cumsum": _cumulative(jnp.add),
+    "cumprod": _cumulative(jnp.multiply),
+    "cummax": _cumulative(jnp.maximum),
+    "cummin": _cumulative(jnp.minimum),
+    "geqrf": _geqrf,
+    "householder_product": lambda program, a, tau: _applied(
+        program, "householder_product", a, tau, shapes=[a.shape[-2:]], ranks=(2, 1)
+    ),
+    "ormqr": _composed(_ormqr),
+    "qr": _qr,
+    "eigh": _eigh,
+    "cholesky": lambda program, a: _applied(program, "cholesky", a, shapes=[a.shape[-2:]]),
+    "triangular_solve": _triangular_solve,
+    "lu": _lu,
+    "lu_pivots_to_permutation": lambda program, pivots, *, permutation_size: _applied(
+        program, "permutation", pivots, shapes=[(permutation_size,)], ranks=(1,), kind="int"
+    ),
 }
 """Rules by name of the primitive."""

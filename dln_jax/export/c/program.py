@@ -9,9 +9,9 @@ gathers and selections at constant indices) is a `gather`: it names the source o
 | `gather` | elements of the sources, laid end to end, at the positions `value` |
 | a name in `operations.OPERATIONS` | elementwise, on arguments of one shape or scalars; small results are scalars |
 | `dot_general` | A [b, m, k], B [b, k, n] -> sum over k [b, m, n] |
-| `reduce_*`, `arg*` | reduction over the last axis of the argument [o, r] |
+| `reduce_*` | reduction over the last axis of the argument [o, r] |
 | `take` | flat elements of the first argument at the second's indices |
-| `order` | flat indices that sort rows by keys [o, n], the first key first |
+| `order` | flat indices that sort rows [o, n] |
 | `put_*` | the first argument [n] with updates (third) at flat indices (second); negative ones are dropped |
 | `cholesky`, `triangular_solve`, `lu` | of a small dense matrix |
 | `permutation` | the order of rows after the exchanges of `lu` |
@@ -20,28 +20,36 @@ gathers and selections at constant indices) is a `gather`: it names the source o
 | `call` | a call of another program |
 | `while`, `repeat`, `branch` | control flow; `project` takes a result, an iteration reads `carry` and `counter` |
 
-`simplify` decides which operations are replaced by simpler ones and which are written as scalars.
+Simplifications keep the results of IEEE arithmetic, except the sign of zero in 0 + x = x, which XLA simplifies too.
+1 x = x always holds, but 0 x = 0, 0 / x = 0 and 0 - x = -x hold only for finite numbers: they are applied in programs
+that assume finite arguments (`Program.finite`), so that structural zeros of a derivative cost nothing.
 """
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from math import prod
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from dln_jax.export.c import simplify
-from dln_jax.export.c.nodes import Loop, Node, Region, is_constant, owners, values, without_unused
-from dln_jax.export.c.operations import COMMUTATIVE, OPERATIONS, on_kind
-from dln_jax.export.c.text import LARGEST, NUMPY_TYPES
+from dln_jax.export.c.nodes import (
+    UNROLL_LIMIT,
+    Loop,
+    Node,
+    Region,
+    is_all,
+    is_constant,
+    is_uniform,
+    owners,
+    sources_of,
+    unrolls,
+    unrolls_product,
+    values,
+    without_unused,
+)
+from dln_jax.export.c.operations import COMMUTATIVE, OPERATIONS, neutral, on_kind
+from dln_jax.export.c.text import LARGEST, NUMPY_TYPES, UNSIGNED
 from dln_jax.types import InputError
-
-
-class Part(NamedTuple):
-    """A program that others call."""
-
-    program: "Program"
-    results: list[Node]
 
 
 @dataclass
@@ -56,8 +64,8 @@ class Program:
     """NumPy type of real numbers; constants are folded in it."""
     repeated: Collection[int] = ()
     """`id` values of jaxprs whose calls stay calls."""
-    parts: dict[Any, Part] = field(default_factory=dict)
-    """Called programs by the `id` of the jaxpr and the constant arguments, which are the attribute of a `call`."""
+    parts: dict[Any, tuple["Program", list[Node]]] = field(default_factory=dict)
+    """Called programs with their results, by the attribute of a `call`: `id` of the jaxpr, and constant arguments."""
     inline: Any = None
     """(program, closed jaxpr, arguments) -> results."""
     finite: bool = False
@@ -102,8 +110,7 @@ class Program:
         """Returns the elements at `positions` [shape] of the sources laid end to end."""
         inner, flat, start = [], [], 0
         for source in sources:
-            parts = source.args if source.op == "gather" else (source,)
-            within = np.arange(source.size) if source.value is None or source.op == "const" else source.value.ravel()
+            parts, within = sources_of(source)
             inner += parts
             flat.append(within + start)
             start += sum(part.size for part in parts)
@@ -112,9 +119,8 @@ class Program:
         if not inner or positions.size == 0:
             return self.constant(np.zeros(positions.shape), sources[0].dtype)
         if all(source.op == "const" for source in inner):
-            total = sum(source.size for source in inner)
-            if positions.size <= max(total, 64):
-                joined = np.concatenate([source.value.ravel() for source in inner if source.value is not None])
+            joined = np.concatenate([values(source).ravel() for source in inner])
+            if positions.size <= max(joined.size, UNROLL_LIMIT):
                 return self.constant(joined[positions], inner[0].dtype)
         alone = len(inner) == 1 and inner[0].shape == positions.shape
         if alone and np.array_equal(positions.ravel(), np.arange(positions.size)):
@@ -145,10 +151,9 @@ class Program:
             with np.errstate(all="ignore"):
                 value = operation.fold(*map(values, args))
             return self.constant(np.broadcast_to(value, shape), dtype)
-        for other in (simplify.simpler, simplify.below_broadcast):
-            if (equal := other(self, op, args, shape)) is not None:
-                return equal
-        if simplify.unrolls(self, op, args, shape):
+        if equal := self._simpler(op, args, shape) or self._below_broadcast(op, args, shape):
+            return equal
+        if unrolls(op, args, shape, finite=self.finite):
             columns = [self.scalars(arg) * (prod(shape) if arg.shape == () else 1) for arg in args]
             elements = [self.elementwise(op, *row) for row in zip(*columns, strict=True)]
             return self.gather(elements, np.arange(len(elements)).reshape(shape))
@@ -156,18 +161,71 @@ class Program:
             args = tuple(sorted(args, key=lambda arg: arg.number))
         return self.make(op, shape, dtype, args)
 
+    def _simpler(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
+        """Returns an equal node that takes less work than the operation, or None."""
+        a, b = args[0], args[-1]
+        for kept, other in ((a, b), (b, a))[: 2 if op in (*COMMUTATIVE, "max", "min") else 1]:
+            if (number := neutral(op, a.dtype)) is not None and is_all(other, number):
+                return self.broadcast(kept, shape)
+        if op == "select" and is_constant(a):
+            index = np.arange(prod(shape)).reshape(shape)
+            both = [self.broadcast(case, shape) for case in (b, args[1])]
+            return self.gather(both, np.where(values(a), index + index.size, index))
+        if op in ("add", "sub") and b.op == "neg":
+            return self.elementwise("sub" if op == "add" else "add", a, b.args[0])
+        if op == "add" and a.op == "neg":
+            return self.elementwise("sub", b, a.args[0])
+        if op == "neg" and a.op == "neg":
+            return a.args[0]
+        if (op in ("max", "min") and a is b) or (op == "select" and args[1] is b):
+            return self.broadcast(b, shape)
+        if op == "multiply_add":
+            factors = args[:2]
+            trivial = is_all(b, 0) or any(is_all(factor, 1) for factor in factors)
+            if trivial or (self.finite and any(is_all(factor, 0) for factor in factors)):
+                return self.elementwise("add", self.elementwise("mul", *factors), b)
+            return None
+        unsigned, real = a.dtype in UNSIGNED, a.dtype == "real"
+        alike = a is b and (op in ("lt", "gt") or (not real and op in ("eq", "ne", "le", "ge")))
+        beside_zero = (op in ("lt", "ge") and is_all(b, 0)) or (op in ("gt", "le") and is_all(a, 0))
+        if alike or (unsigned and beside_zero):  # compilers warn about comparisons with a known result
+            return self.broadcast(self.constant(op in ("eq", "le", "ge"), "bool"), shape)
+        if real and not self.finite:
+            return None
+        if op == "sub" and is_all(a, 0):
+            return self.elementwise("neg", self.broadcast(b, shape))
+        absorbs = op == "mul" or (op == "min" and unsigned)
+        if (absorbs and is_all(b, 0)) or ((absorbs or (op == "div" and real)) and is_all(a, 0)):
+            return self.broadcast(self.constant(0, a.dtype), shape)
+        return None
+
+    def _below_broadcast(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
+        """Returns the operation applied before a common broadcast of its arguments, or None if they share none."""
+        repeated = [arg for arg in args if arg.size > 1 and not is_uniform(arg)]
+        if prod(shape) <= 1 or any(arg.op != "gather" or len(arg.args) > 1 for arg in repeated):
+            return None
+        if not repeated:
+            return self.broadcast(self.elementwise(op, *map(self.one, args)), shape)
+        positions, source = np.asarray(repeated[0].value), repeated[0].args[0]
+        for arg in repeated:
+            alike = arg.args[0].shape == source.shape and np.array_equal(np.asarray(arg.value), positions)
+            if not alike or source.size >= arg.size:
+                return None
+        below = [arg.args[0] if arg in repeated else self.one(arg) for arg in args]
+        return self.gather([self.elementwise(op, *below)], positions)
+
     def dot_general(self, a: Node, b: Node) -> Node:
         """Returns sum_k a[b, m, k] b[b, k, n]; products with a constant are transposed so that it comes second."""
         (batch, m, k), n = a.shape, b.shape[2]
-        if a.op == b.op == "const" and a.value is not None and b.value is not None:
-            return self.constant(np.matmul(a.value, b.value), a.dtype)
+        if a.op == b.op == "const":
+            return self.constant(np.matmul(values(a), values(b)), a.dtype)
         if k == 0:
             return self.constant(np.zeros((batch, m, n)), a.dtype)
         if k == 1:
             return self.elementwise("mul", self.broadcast(a, (batch, m, n)), self.broadcast(b, (batch, m, n)))
         if is_constant(a) and not is_constant(b):
             return self.transpose(self.dot_general(self.transpose(b), self.transpose(a)))
-        if not simplify.unrolls_product(self, a, b):
+        if not unrolls_product(a, b, finite=self.finite):
             return self.make("dot_general", (batch, m, n), a.dtype, (a, b))
         left, right = (np.array(self.scalars(node), object).reshape(node.shape) for node in (a, b))
         elements = [self._dot(left[batch, i], right[batch, :, j]) for batch, i, j in np.ndindex(batch, m, n)]
@@ -177,24 +235,17 @@ class Program:
         (a, b), *rest = zip(left, right, strict=True)
         total = self.elementwise("mul", a, b)
         for a, b in rest:
-            if a.dtype == "real":
-                total = self.elementwise("multiply_add", a, b, total)
-            else:
-                total = self.elementwise("add", total, self.elementwise("mul", a, b))
+            total = self.elementwise("multiply_add", a, b, total)
         return total
 
     def scalars(self, node: Node) -> list[Node]:
         """Returns the elements of a node as scalars."""
         key = node, self.floor
         if key not in self._scalars:
-            if node.op == "gather":
-                owner, starts = owners(node.args, np.asarray(node.value).ravel())
-                places = np.asarray(node.value).ravel() - starts[owner]
-                self._scalars[key] = [
-                    self._element(node.args[k], place) for k, place in zip(owner, places, strict=True)
-                ]
-            else:
-                self._scalars[key] = [self._element(node, np.int64(place)) for place in range(node.size)]
+            parts, positions = sources_of(node)
+            owner, starts = owners(parts, positions)
+            places = positions - starts[owner]
+            self._scalars[key] = [self._element(parts[k], place) for k, place in zip(owner, places, strict=True)]
         return self._scalars[key]
 
     def _element(self, node: Node, place: np.int64) -> Node:
@@ -209,13 +260,3 @@ class Program:
     def transpose(self, node: Node) -> Node:
         """Returns the node with its last two axes exchanged."""
         return self.gather([node], np.swapaxes(np.arange(node.size).reshape(node.shape), -1, -2))
-
-    def select(self, chosen: Node, if_false: Node, if_true: Node) -> Node:
-        """Returns an elementwise selection; with a constant condition it is a gather."""
-        shape = np.broadcast_shapes(chosen.shape, if_false.shape, if_true.shape)
-        if is_constant(chosen):
-            chosen_value = np.broadcast_to(values(chosen), shape)
-            both = [self.broadcast(case, shape) for case in (if_false, if_true)]
-            index = np.arange(chosen_value.size).reshape(shape)
-            return self.gather(both, np.where(chosen_value, index + chosen_value.size, index))
-        return self.elementwise("select", chosen, if_true, if_false)

@@ -27,8 +27,7 @@ from dln_jax.export.c.interface import (
     description,
     result_leaves,
 )
-from dln_jax.export.c.jaxprs import repeated_calls, traced
-from dln_jax.export.c.lowering import program_of
+from dln_jax.export.c.lowering import program_of, repeated_calls, traced
 from dln_jax.export.c.templates import CASADI_ABOUT, CASADI_BUILD, NEEDED, about, cmake, demo, header, preamble
 from dln_jax.export.c.text import PRECISIONS, check_name, comment, kind_of
 from dln_jax.export.exports import write_exports
@@ -125,10 +124,10 @@ def source_files(
         )
         version = importlib.metadata.version("dln-jax")
         written_by = f"Written by dln-jax {version}, C format {FORMAT}."
-        parts = dict.fromkeys(part.text for part in source.parts.values())
+        text = "".join([*(part.text for part in source.parts.values()), *texts])
         files = {
             f"{name}.h": header(name, written_by, signatures, precision, left_out),
-            f"{name}.c": comment(f"{name}.c", written_by, NEEDED) + "".join([preamble(source, name), *parts, *texts]),
+            f"{name}.c": comment(f"{name}.c", written_by, NEEDED) + preamble(source, name, text) + text,
             f"{name}_demo.c": demo(name, signatures, precision),
             "CMakeLists.txt": cmake(name),
         }
@@ -140,7 +139,7 @@ def source_files(
                 name, chosen, Source("f64", libm, finite, loop_bound), stack=stack, leave_out=leave_out_large
             )
             title = about(CASADI_ABOUT.format(name=name, written_by=written_by), left_out=left_out)
-            files[f"{name}_casadi.c"] = title + preamble(source, name) + text
+            files[f"{name}_casadi.c"] = title + preamble(source, name, text) + text
             files["CMakeLists.txt"] += CASADI_BUILD.format(name=name)
     if (longest := max(map(len, files.values()))) > LENGTH:
         raise InputError(f"the source would take {longest / 1e6:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")

@@ -1,5 +1,6 @@
 """Texts of the exported files: header, preamble, demo program, CasADi interface and CMake file."""
 
+import re
 from collections.abc import Mapping, Sequence
 from math import prod
 
@@ -200,17 +201,22 @@ target_link_libraries({name}_demo PRIVATE {name})
 """
 
 
-def preamble(source: Source, name: str) -> str:
-    """Returns the part of a source before its functions."""
+def preamble(source: Source, name: str, text: str) -> str:
+    """Returns the part of a source before the text of its functions, with the helper functions that they call."""
     precision = source.precision
+    called = set(re.findall(r"\belementary_(\w+)\(", text))
+    on_matrices = re.findall(r"\b(?:elementary_)?(\w+)\(", text)
+    if called & {"word_of", "number_of"}:
+        called.add("choice")
+    arrays = {function.removesuffix("_each") for function in called if function.endswith("_each")}
     tables = "".join(f"{table(*named, precision)}\n" for named in source.tables.values())
     return "".join((
         fill(_PREAMBLE, precision, name=name, upper=source.suffix.upper()),
         tables.removesuffix("\n"),
-        elementary.definitions(source.functions, precision, arrays=source.arrays),
-        operations.definitions(source.integers, precision),
-        kernels.orderings(source.orders),
-        factorisations.definitions(source.kernels, source.suffix),
+        elementary.definitions(called, precision, arrays=arrays),
+        operations.definitions(called, precision),
+        kernels.orderings(called),
+        factorisations.definitions(on_matrices, source.suffix),
     ))  # fmt: skip
 
 

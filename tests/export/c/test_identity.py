@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from comparison import needs_compiler
 
-from dln_jax.export.c import jaxprs
+from dln_jax.export.c import lowering
 from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c, source_files
@@ -18,7 +18,7 @@ from dln_jax.scenes.pendulums import chain
 @pytest.fixture(autouse=True)
 def small_functions_are_called(monkeypatch):
     """Not inlined, as only large ones are otherwise."""
-    monkeypatch.setattr(jaxprs, "_LARGE_CALL", 6)
+    monkeypatch.setattr(lowering, "_LARGE_CALL", 6)
 
 
 def model(weights):
@@ -57,12 +57,6 @@ def test_models_in_one_export_keep_their_own_weights(tmp_path):
     loaded = load_c(tmp_path, flags=("-O1",))
     for name, function in functions.items():
         np.testing.assert_allclose(getattr(loaded, name)(STATE), function(STATE), rtol=1e-12)
-
-
-def test_functions_of_equal_programs_are_one_however_they_came_about():
-    alike, differing = of_two(model(W), model(W.copy())), of_two(model(W), model(np.nextafter(W, 1)))
-    assert parts(source_files({"f": (alike, (STATE,))}, name="model")) == 1
-    assert parts(source_files({"f": (differing, (STATE,))}, name="model")) == 2
 
 
 def test_what_is_called_counts_with_what_calls_it():

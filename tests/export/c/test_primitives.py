@@ -213,7 +213,9 @@ def counted(y, n):
 CONTROL = {
     "while": lambda x, n: lax.while_loop(lambda s: s[1] < n, lambda s: (s[0] * 0.9 + x, s[1] + 1), (x, 0)),
     "while_swapped": lambda x, n: lax.while_loop(
-        lambda s: s[2] < 3, lambda s: (s[1], s[0] + 1, s[2] + 1), (x, 2 * x, 0)
+        lambda s: lax.cond(n > 2, jnp.any, lambda k: k < 2, s[2] ** 2),
+        lambda s: (s[1], s[0] + 1, s[2] + 1),
+        (x, 2 * x, 0),
     ),
     "while_without_turn": lambda x, n: lax.while_loop(lambda y: jnp.all(y != y), lambda y: y + 1, 0 * x + 1),
     "scan_of_rows": lambda x, n: lax.scan(

@@ -15,7 +15,7 @@ from comparison import needs_compiler
 from conftest import slow_among
 from sanitized import in_sanitized_c
 
-from dln_jax.export.c import jaxprs
+from dln_jax.export.c import lowering
 from dln_jax.export.c.source import source_files
 
 BATCHES = [range(2), range(2, 20), range(20, 40), range(40, 60)]
@@ -26,7 +26,7 @@ BOUND = 1e-12
 @pytest.fixture(autouse=True)
 def small_functions_are_called(monkeypatch):
     """Not inlined, as only large ones are otherwise."""
-    monkeypatch.setattr(jaxprs, "_LARGE_CALL", 6)
+    monkeypatch.setattr(lowering, "_LARGE_CALL", 6)
 
 
 def programs_of(seeds):
