@@ -4,8 +4,7 @@
 |---|---|---|
 | `NaturalSystem` | factor of M, V, D | `mechanics.natural` |
 | `NaturalHamiltonian` | factor of M⁻¹, V, D | `mechanics.natural` |
-| `ClosedForm` | M, V, D, and the resulting forces | `mechanics.closed_form` |
-| `RecursiveSystem` | M, V, D, and all forces by a recursion | `mechanics.closed_form` |
+| `ExplicitSystem` | M, V, D, and the resulting forces | `mechanics.explicit` |
 | `LagrangianSystem` | L, D | `mechanics.lagrangian` |
 | `HamiltonianSystem` | H, D | `mechanics.hamiltonian` |
 | `LoadedSystem` | any of these, and load-dependent friction | `mechanics.joint_friction` |
@@ -20,9 +19,8 @@ from typing import Any, overload
 
 import jax.numpy as jnp
 
-from dln_jax.mechanics import closed_form, hamiltonian, lagrangian, natural
+from dln_jax.mechanics import explicit, hamiltonian, lagrangian, natural
 from dln_jax.mechanics.arguments import answer, vectors
-from dln_jax.mechanics.closed_form import ClosedForm, RecursiveSystem
 from dln_jax.mechanics.dynamics import (
     Dynamics,
     Flow,
@@ -34,6 +32,7 @@ from dln_jax.mechanics.dynamics import (
     friction_of,
     make_plain_dynamics,
 )
+from dln_jax.mechanics.explicit import ExplicitSystem
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.joint_friction import LoadedSystem, link_force, loaded_dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
@@ -42,7 +41,7 @@ from dln_jax.types import Hamiltonian, InputError, Vector
 
 Canonical = NaturalHamiltonian | HamiltonianSystem
 """Energies in terms of momenta."""
-Energies = NaturalSystem | ClosedForm | RecursiveSystem | LagrangianSystem | Canonical | LoadedSystem
+Energies = NaturalSystem | ExplicitSystem | LagrangianSystem | Canonical | LoadedSystem
 Driven = Energies | InverseForward
 """Systems with applied forces."""
 System = Driven | PhaseRates
@@ -61,8 +60,7 @@ def _dynamics_of_functions(system: InverseForward, *, degrees_of_freedom: int | 
 
 _DYNAMICS: dict[type, Any] = {
     NaturalSystem: natural.dynamics,
-    ClosedForm: closed_form.dynamics,
-    RecursiveSystem: closed_form.dynamics,
+    ExplicitSystem: explicit.dynamics,
     LagrangianSystem: lagrangian.dynamics,
     NaturalHamiltonian: natural.hamiltonian_dynamics,
     HamiltonianSystem: hamiltonian.dynamics,
@@ -139,8 +137,8 @@ def hamiltonian_of(system: Energies) -> Hamiltonian:
             return system.hamiltonian
         case NaturalHamiltonian() | NaturalSystem():
             return natural.hamiltonian(system)
-        case ClosedForm() | RecursiveSystem():
-            return hamiltonian.legendre(closed_form.lagrangian(system), iterations=1)
+        case ExplicitSystem():
+            return hamiltonian.legendre(explicit.lagrangian(system), iterations=1)
         case LagrangianSystem():
             return hamiltonian.legendre(system.lagrangian)
         case LoadedSystem():

@@ -21,16 +21,16 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from dln_jax.mechanics.closed_form import ClosedForm, RecursiveSystem
 from dln_jax.mechanics.dynamics import InverseForward, friction_force
 from dln_jax.mechanics.equations import Driven, Energies, dynamics
+from dln_jax.mechanics.explicit import ExplicitSystem
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.joint_friction import LoadedSystem
 from dln_jax.mechanics.natural import NaturalHamiltonian, NaturalSystem
 from dln_jax.solvers.elimination import solve, solve_lower
 from dln_jax.types import Matrix, Vector
 
-Natural = NaturalSystem | ClosedForm | RecursiveSystem | NaturalHamiltonian
+Natural = NaturalSystem | ExplicitSystem | NaturalHamiltonian
 """Energies with a mass matrix that depends on q alone."""
 Jacobians = tuple[Array, Array, Array]
 """Derivatives [d, d] by three arguments; row i belongs to result i."""

@@ -33,7 +33,7 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float
 
-from dln_jax.mechanics.closed_form import RecursiveSystem
+from dln_jax.mechanics.explicit import ExplicitSystem
 from dln_jax.mechanics.friction import (
     USUAL,
     FrictionCoefficients,
@@ -227,7 +227,7 @@ def make_serial_tree(
         inertias, armature = jnp.tile(body, (d, 1)), jnp.full(d, 0.01, dtype)
         return SerialTreeParameters(turns, 0.15 * positions, inertias, armature, none, none, none)
 
-    def energies(parameters: SerialTreeParameters) -> RecursiveSystem:
+    def energies(parameters: SerialTreeParameters) -> ExplicitSystem:
         coefficients = parameters.viscous, parameters.coulomb, parameters.offset
         dissipation = joint_dissipation(*coefficients, velocity_scale=velocity_scale)
         return tree_system(tree_of(parameters, needs, parents=parents, acceleration=acceleration), dissipation)

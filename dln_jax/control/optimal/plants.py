@@ -26,8 +26,7 @@ from dln_jax.control.optimal.fitted import Iteration
 from dln_jax.control.optimal.flow import limits
 from dln_jax.control.optimal.problem import ControlProblem, from_plant, rates
 from dln_jax.control.state_space import Law, circular, error
-from dln_jax.mechanics import closed_form
-from dln_jax.mechanics.closed_form import ClosedForm
+from dln_jax.mechanics.explicit import ExplicitSystem, closed_form, dynamics
 from dln_jax.mechanics.integrators import Tableau, runge_kutta
 from dln_jax.nn.activations import softplus
 from dln_jax.scenes.pendulums import cart_pole, rotary_pendulum
@@ -105,7 +104,7 @@ class Returns(NamedTuple):
 def pendulum() -> ValuePlant:
     """Returns a driven rod of 1 kg and 1 m: thdd = 3 (u + g/2 sin θ). Its 2.5 N m are too weak to lift it at once."""
     weight = 9.81 / 2
-    rod = ClosedForm(
+    rod = closed_form(
         lambda q: jnp.full((1, 1), 1 / 3, q.dtype),
         lambda q, qd: jnp.zeros_like(q),
         lambda q: weight * jnp.cos(q[0]),
@@ -204,7 +203,7 @@ def evaluate(plant: ValuePlant, law: Law, x: Any) -> Returns:
 
 
 def _problem(
-    plant: ClosedForm,
+    plant: ExplicitSystem,
     actuation: Sequence[Sequence[float]] | None,
     joints: tuple[JointKind, ...],
     weights: Sequence[float],
@@ -214,7 +213,7 @@ def _problem(
     box: Sequence[float],
     penalised: Sequence[float] | None = None,
 ) -> ControlProblem:
-    a, B = from_plant(closed_form.dynamics(plant), actuation)
+    a, B = from_plant(dynamics(plant), actuation)
     angles = circular(joints, len(box))
 
     def ways(x: Any) -> list[Any]:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dln_jax.mechanics.closed_form import RecursiveSystem
+from dln_jax.mechanics.explicit import ExplicitSystem
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.frames import Placed, aligned, cross, inwards, outwards, placed
@@ -180,14 +180,14 @@ def tree_energies(tree: Tree, dissipation: Dissipation | None = None) -> Lagrang
     return LagrangianSystem(lagrangian(tree), dissipation)
 
 
-def tree_system(tree: Tree, dissipation: Dissipation | None = None) -> RecursiveSystem:
+def tree_system(tree: Tree, dissipation: Dissipation | None = None) -> ExplicitSystem:
     """Returns the record for `equations.dynamics`, with forces by recursions.
 
     Args:
         tree: a tree of known or learned numbers.
         dissipation: (q, qd) -> Rayleigh function.
     """
-    return RecursiveSystem(
+    return ExplicitSystem(
         mass_matrix=lambda q: composite_bodies(tree, q),
         forces=lambda q, qd, qdd: newton_euler(tree, q, qd, qdd),
         potential=(lambda q: potential_energy(tree, q)) if tree.needs.gravity else None,
