@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from dln_jax.mechanics import integrators
 from dln_jax.mechanics.dynamics import Rates
-from dln_jax.mechanics.integrators import Field, State, advance
+from dln_jax.mechanics.integrators import Method, State, advance
 from dln_jax.rollout import rollout
 from dln_jax.solvers.elimination import solve
 from dln_jax.types import InputError, require_positive
@@ -141,7 +141,7 @@ def driven(
     durations: Array,
     *,
     substeps: int,
-    method: Callable[[Field], integrators.Step] = integrators.rk4,
+    method: Method = integrators.rk4,
 ) -> State:
     """Integrates y' = rate(y, tau(t)) and returns the states at the samples; leaves get a leading axis T.
 

@@ -31,7 +31,7 @@ from dln_jax.control.plants.plant import ACTIVE_SPREAD, SPREAD, Layout
 from dln_jax.control.state_space import field_of, holding_controls
 from dln_jax.control.swing_up import nearest_equilibrium
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
-from dln_jax.mechanics.integrators import CLASSICAL
+from dln_jax.mechanics.integrators import rk4
 from dln_jax.nn.activations import softplus
 from dln_jax.types import InputError, JointKind, Scalar
 
@@ -226,7 +226,7 @@ def own_plant(model: Dynamics | PlainDynamics, numbers: OwnProblem) -> ValuePlan
         [*numbers.hanging, *np.zeros(d)], [*spread**2, *(still**2)], [*np.where(turning, np.pi, half[:d] / 3), *still]
     )
     evaluation = Evaluation(
-        rate=20 * scale, seconds=HORIZON / scale, held=1, method=CLASSICAL, clipped=False, near=NEAR,
+        rate=20 * scale, seconds=HORIZON / scale, held=1, method=rk4, clipped=False, near=NEAR,
         positions=ranges if np.isfinite(ranges).any() else None,
     )  # fmt: skip
     angles = tuple(k for k, kind in enumerate(numbers.joints) if kind == "revolute")

@@ -27,7 +27,7 @@ from dln_jax.control.optimal.flow import limits
 from dln_jax.control.optimal.problem import ControlProblem, from_plant, rates
 from dln_jax.control.state_space import Law, circular, error
 from dln_jax.mechanics.explicit import ExplicitSystem, closed_form, dynamics
-from dln_jax.mechanics.integrators import Tableau, runge_kutta
+from dln_jax.mechanics.integrators import Method, explicit_euler
 from dln_jax.nn.activations import softplus
 from dln_jax.scenes.pendulums import cart_pole, rotary_pendulum
 from dln_jax.types import JointKind, Scalar
@@ -36,7 +36,6 @@ MARGIN = 1e-3
 """Margin of the action cost's range beyond the limit."""
 HORIZON = 5.0
 """Time until a cost has the weight `share`, s."""
-EULER = Tableau(((0.0,),), (1.0,))
 Where = Literal["down", "uniform"]
 
 
@@ -58,7 +57,7 @@ class Evaluation(NamedTuple):
     seconds: float = 5.0
     held: int = 2
     """Steps for which a control is held."""
-    method: Tableau = EULER
+    method: Method = explicit_euler
     clipped: bool = True
     """Whether states that are not on a circle are clipped to the box; otherwise a run that leaves `positions` fails."""
     positions: Any = None
@@ -179,7 +178,7 @@ def evaluate(plant: ValuePlant, law: Law, x: Any) -> Returns:
     def sample(carry: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         x, total = carry
         u = jnp.clip(law(x), -plant.limit, plant.limit)
-        step = runge_kutta(how.method, lambda t, x: field(x, u))
+        step = how.method(lambda t, x: field(x, u))
         for _ in range(how.held):
             total = total - dt * (problem.state_cost(x) + plant.rest + problem.action_cost.cost(u))
             x = jnp.clip(step(0.0, x, dt), low, high)
