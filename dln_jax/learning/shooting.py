@@ -43,7 +43,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import window_indices
 from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by
 from dln_jax.mechanics.discrete import Torque, driven, torque_slopes
-from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainDynamics, PlainFlow
+from dln_jax.mechanics.dynamics import Dynamics, Flow, PhaseRates, PlainDynamics
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.integrators import looped_rk4, rk4, rollout
 from dln_jax.models.model import Model, Parameters
@@ -103,7 +103,7 @@ class Weights(NamedTuple):
 
 
 def phase_motion(
-    field: Flow | PlainFlow, start: Array, t: Float[Array, " T"], *, substeps: int
+    field: Flow | PhaseRates, start: Array, t: Float[Array, " T"], *, substeps: int
 ) -> Float[Array, "T two_d"]:
     """States (q, p) at the times t from `start` [2 d], by RK4."""
     first = tuple(jnp.split(start, 2))

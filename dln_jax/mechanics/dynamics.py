@@ -69,12 +69,6 @@ class Flow(NamedTuple):
     """(q, p) -> H, scalar."""
 
 
-class PlainFlow(NamedTuple):
-    """Flow of a system without energy."""
-
-    rates: Rates
-
-
 class InverseForward(NamedTuple):
     """A system without energy: two functions of one state that need not be inverses of each other."""
 
@@ -87,7 +81,7 @@ class InverseForward(NamedTuple):
 class PhaseRates(NamedTuple):
     """Rates of a state in a phase space."""
 
-    rates: Callable[[Array, Array], tuple[Array, Array]]
+    rates: Callable[..., tuple[Array, Array]]
     """(q, p) -> (qd, pd), both [d]."""
     hamiltonian: Hamiltonian | None = None
     """(q, p) -> energy of a part of the field; `None` for a field without energy."""

@@ -27,7 +27,6 @@ from dln_jax.mechanics.dynamics import (
     InverseForward,
     PhaseRates,
     PlainDynamics,
-    PlainFlow,
     decompose_by_differences,
     friction_of,
     make_plain_dynamics,
@@ -93,8 +92,8 @@ def dynamics(system: System, *, degrees_of_freedom: int | None = None) -> Dynami
 @overload
 def flow(system: Energies, *, degrees_of_freedom: int | None = None) -> Flow: ...
 @overload
-def flow(system: PhaseRates, *, degrees_of_freedom: int | None = None) -> Flow | PlainFlow: ...
-def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | PlainFlow:
+def flow(system: PhaseRates, *, degrees_of_freedom: int | None = None) -> Flow | PhaseRates: ...
+def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | PhaseRates:
     """Returns the functions of a system in (q, p), without applied forces; arguments as for `dynamics`.
 
     Raises:
@@ -103,10 +102,10 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pla
     d = degrees_of_freedom
     if isinstance(system, PhaseRates):
         rates, energy = system
-        checked_rates = PlainFlow(lambda q, p: answer(rates, *vectors(d, q=q, p=p)))
+        checked = PhaseRates(lambda q, p: answer(rates, *vectors(d, q=q, p=p)))
         if energy is None:
-            return checked_rates
-        return Flow(*checked_rates, lambda q, p: answer(energy, *vectors(d, q=q, p=p)))
+            return checked
+        return Flow(checked.rates, lambda q, p: answer(energy, *vectors(d, q=q, p=p)))
     if not isinstance(system, Energies):
         known = [*_DYNAMICS, PhaseRates]
         known.remove(InverseForward)

@@ -13,7 +13,7 @@ from jax import Array
 
 from dln_jax.files import is_file
 from dln_jax.mechanics import equations
-from dln_jax.mechanics.dynamics import Dynamics, Flow, InverseForward, PhaseRates, PlainDynamics, PlainFlow
+from dln_jax.mechanics.dynamics import Dynamics, Flow, InverseForward, PhaseRates, PlainDynamics
 from dln_jax.models import uncertainty as uncertainties
 from dln_jax.models.baselines import Derivatives, FunctionModel
 from dln_jax.models.latent_phase import ImageModel, LatentPhase
@@ -37,7 +37,7 @@ from dln_jax.zoo.parameter_files import (
 if TYPE_CHECKING:
     from dln_jax.zoo.value_functions import ValueRun
 
-Functions = TypeVar("Functions", bound=Dynamics | PlainDynamics | Flow | PlainFlow)
+Functions = TypeVar("Functions", bound=Dynamics | PlainDynamics | Flow | PhaseRates)
 AnyModel = Model | FunctionModel | ImageModel
 
 
@@ -80,7 +80,7 @@ class Run:
         return self._compiled("dynamics", equations.dynamics, PhaseRates)
 
     @functools.cached_property
-    def flow(self) -> Flow | PlainFlow:
+    def flow(self) -> Flow | PhaseRates:
         """Functions of coordinates and momenta, without applied forces. Raises InputError for a model that has none."""
         return self._compiled("flow", equations.flow, InverseForward)
 
@@ -237,7 +237,8 @@ def read_description(directory: Path) -> Description:
 
 def compiled(functions: Functions, dtype: Any) -> Functions:
     """Jits the functions and converts numbers in their arguments to one dtype."""
-    return type(functions)(*(_jitted(function, dtype) for function in functions))
+    jitted = {name: _jitted(function, dtype) for name, function in functions._asdict().items() if function is not None}
+    return functions._replace(**jitted)
 
 
 def _jitted(function: Callable[..., Any], dtype: Any) -> Any:
