@@ -118,6 +118,13 @@ def cross(a: Any, b: Any) -> Vector3:
     return jnp.stack([jnp.asarray(difference(*pair)) for pair in ((1, 2), (2, 0), (0, 1))])
 
 
+def hat(v: Vector3) -> Float[Array, "3 3"]:
+    """Returns the matrix of v x."""
+    x, y, z = v
+    zero = jnp.zeros_like(x)
+    return jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
+
+
 def _is_zero(number: Any) -> bool:
     return isinstance(number, float | np.floating) and bool(number == 0)
 
@@ -128,10 +135,13 @@ def world_frames(tree: Tree, q: Vector) -> tuple[Float[Array, "d 3 3"], Float[Ar
     origins: list[Any] = []
     for link, (parent, kind) in enumerate(zip(tree.parents, tree.joints, strict=True)):
         axis = jnp.asarray(tree.axes[link], q.dtype)
-        turn, shift = (_turn(axis, q[link]), 0.0 * axis) if kind == "revolute" else (jnp.eye(3), axis * q[link])
         rotation = jnp.asarray(tree.rotations[link], q.dtype)
-        position = jnp.asarray(tree.positions[link], q.dtype) + rotation @ shift
-        rotation = rotation @ turn
+        position = jnp.asarray(tree.positions[link], q.dtype)
+        if kind == "revolute":  # by Rodrigues' formula
+            K = hat(axis)
+            rotation = rotation @ (jnp.eye(3, dtype=q.dtype) + jnp.sin(q[link]) * K + (1 - jnp.cos(q[link])) * K @ K)
+        else:
+            position = position + rotation @ (axis * q[link])
         if parent >= 0:
             position = origins[parent] + rotations[parent] @ position
             rotation = rotations[parent] @ rotation
@@ -168,11 +178,3 @@ def frame_jacobian(tree: Tree, link: int, point: Any = (0.0, 0.0, 0.0)) -> Calla
         return jnp.stack(columns, axis=1)
 
     return jacobian
-
-
-def _turn(axis: Vector3, angle: Array) -> Float[Array, "3 3"]:
-    """Rodrigues' rotation formula."""
-    x, y, z = axis
-    zero = jnp.zeros_like(x)
-    hat = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
-    return jnp.eye(3, dtype=axis.dtype) + jnp.sin(angle) * hat + (1 - jnp.cos(angle)) * hat @ hat
