@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.mechanics.integrators import Method, advance, rk4
 from dln_jax.types import InputError, JointKind, Vector, require_positive
 
@@ -31,7 +31,7 @@ class Linearisation(NamedTuple):
     u: Vector
 
 
-def field_of(plant: Dynamics | PlainDynamics, actuation: Any = None) -> Field:
+def field_of(plant: Dynamics | InverseForward, actuation: Any = None) -> Field:
     """Returns the field of a mechanical system, on x = (q, qd) [2 d] and the controls u [m].
 
     Args:

@@ -14,8 +14,7 @@
 All energies have both dynamics and flow; `InverseForward` has dynamics only, `PhaseRates` a flow only.
 """
 
-from functools import partial
-from typing import Any, overload
+from typing import Any, get_args, overload
 
 import jax.numpy as jnp
 
@@ -24,16 +23,14 @@ from dln_jax.mechanics.arguments import answer, vectors
 from dln_jax.mechanics.dynamics import (
     Dynamics,
     Flow,
+    Functions,
     InverseForward,
     PhaseRates,
-    PlainDynamics,
-    decompose_by_differences,
     friction_of,
-    make_plain_dynamics,
 )
 from dln_jax.mechanics.explicit import ExplicitSystem
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
-from dln_jax.mechanics.joint_friction import LoadedSystem, link_force, loaded_dynamics
+from dln_jax.mechanics.joint_friction import LoadedSystem, carried, carrying, link_force
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalHamiltonian, NaturalSystem
 from dln_jax.types import Hamiltonian, InputError, Vector
@@ -46,33 +43,11 @@ Driven = Energies | InverseForward
 System = Driven | PhaseRates
 
 
-def _dynamics_of_loaded(system: LoadedSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    link = dynamics(system.link, degrees_of_freedom=degrees_of_freedom)
-    return loaded_dynamics(system, link, degrees_of_freedom=degrees_of_freedom)
-
-
-def _dynamics_of_functions(system: InverseForward, *, degrees_of_freedom: int | None = None) -> PlainDynamics:
-    # The decomposition takes differences of the inverse function, so friction counts as Coriolis force.
-    decompose = partial(decompose_by_differences, system.inverse_dynamics)
-    return make_plain_dynamics(*system, decompose, degrees_of_freedom=degrees_of_freedom)
-
-
-_DYNAMICS: dict[type, Any] = {
-    NaturalSystem: natural.dynamics,
-    ExplicitSystem: explicit.dynamics,
-    LagrangianSystem: lagrangian.dynamics,
-    NaturalHamiltonian: natural.hamiltonian_dynamics,
-    HamiltonianSystem: hamiltonian.dynamics,
-    LoadedSystem: _dynamics_of_loaded,
-    InverseForward: _dynamics_of_functions,
-}
-
-
 @overload
 def dynamics(system: Energies, *, degrees_of_freedom: int | None = None) -> Dynamics: ...
 @overload
-def dynamics(system: InverseForward, *, degrees_of_freedom: int | None = None) -> PlainDynamics: ...
-def dynamics(system: System, *, degrees_of_freedom: int | None = None) -> Dynamics | PlainDynamics:
+def dynamics(system: InverseForward, *, degrees_of_freedom: int | None = None) -> InverseForward: ...
+def dynamics(system: System, *, degrees_of_freedom: int | None = None) -> Dynamics | InverseForward:
     """Returns the functions of a system in coordinates and velocities.
 
     Args:
@@ -82,11 +57,68 @@ def dynamics(system: System, *, degrees_of_freedom: int | None = None) -> Dynami
     Raises:
         InputError: the system is the rates of a phase space, which do not define forces, or not a record.
     """
-    make = _DYNAMICS.get(type(system))
-    if make is None:
+    d = degrees_of_freedom
+    if not isinstance(system, Driven):
         hint = ": give model.energies(parameters)" if hasattr(system, "energies") else ""
-        raise InputError(f"dynamics got a {type(system).__name__}{hint}; expected one of {_names(*_DYNAMICS)}")
-    return make(system, degrees_of_freedom=degrees_of_freedom)
+        raise InputError(f"dynamics got a {type(system).__name__}{hint}; expected one of {_names(Driven)}")
+    functions = system if isinstance(system, InverseForward) else _functions(system, d)
+    inverse, forward = functions[:2]
+    both = InverseForward(
+        lambda q, qd, qdd: answer(inverse, *vectors(d, q=q, qd=qd, qdd=qdd)),
+        lambda q, qd, tau: answer(forward, *vectors(d, q=q, qd=qd, tau=tau)),
+    )
+    if isinstance(functions, InverseForward):
+        return both
+    energy, mass_matrix, decompose = functions[2:]
+    force = friction_of(system)
+
+    def mass_matrix_or_at_rest(q, qd=None):
+        if qd is None:
+            (q,) = vectors(d, q=q)
+            return answer(mass_matrix, q, jnp.zeros_like(q))
+        return answer(mass_matrix, *vectors(d, q=q, qd=qd))
+
+    def friction(q, qd):
+        q, qd = vectors(d, q=q, qd=qd)
+        return jnp.zeros_like(qd) if force is None else answer(force, q, qd)
+
+    return Dynamics(
+        *both,
+        lambda q, qd: answer(energy, *vectors(d, q=q, qd=qd)),
+        mass_matrix_or_at_rest,
+        lambda q, qd, qdd: answer(decompose, *vectors(d, q=q, qd=qd, qdd=qdd)),
+        friction,
+    )
+
+
+def _functions(system: Energies, d: int | None) -> Functions:
+    """Returns the functions of energies, with friction in forces and accelerations."""
+    match system:
+        case NaturalSystem():
+            functions = natural.functions(system)
+        case ExplicitSystem():
+            functions = explicit.functions(system)
+        case LagrangianSystem():
+            functions = lagrangian.functions(system, d)
+        case NaturalHamiltonian():
+            functions = natural.canonical_functions(system)
+        case HamiltonianSystem():
+            functions = hamiltonian.functions(system)
+        case LoadedSystem(link, load):
+            behind = _functions(link, d)
+            functions = (
+                lambda q, qd, qdd: carrying(load, qd, behind[0](q, qd, qdd)),
+                lambda q, qd, tau: behind[1](q, qd, carried(load, qd, tau)),
+                *behind[2:],
+            )
+    force = friction_of(system)
+    if force is None:
+        return functions
+    return (
+        lambda q, qd, qdd: functions[0](q, qd, qdd) + force(q, qd),
+        lambda q, qd, tau: functions[1](q, qd, tau - force(q, qd)),
+        *functions[2:],
+    )
 
 
 @overload
@@ -107,9 +139,7 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pha
             return checked
         return Flow(checked.rates, lambda q, p: answer(energy, *vectors(d, q=q, p=p)))
     if not isinstance(system, Energies):
-        known = [*_DYNAMICS, PhaseRates]
-        known.remove(InverseForward)
-        raise InputError(f"flow got a {type(system).__name__}; expected one of {_names(*known)}")
+        raise InputError(f"flow got a {type(system).__name__}; expected one of {_names(Energies | PhaseRates)}")
     H = hamiltonian_of(system)
 
     def hamilton(q, p):
@@ -144,5 +174,5 @@ def hamiltonian_of(system: Energies) -> Hamiltonian:
             return hamiltonian_of(system.link)
 
 
-def _names(*types: type) -> str:
-    return ", ".join(record.__name__ for record in types)
+def _names(records: Any) -> str:
+    return ", ".join(record.__name__ for record in get_args(records))

@@ -15,9 +15,8 @@ from jax import Array
 
 from dln_jax.mechanics.dynamics import (
     Decomposition,
-    Dynamics,
+    Functions,
     decompose_by_differences,
-    make_dynamics,
     minus_potential,
     plus_potential,
 )
@@ -76,8 +75,8 @@ def lagrangian(system: ExplicitSystem) -> Lagrangian:
     return lambda q, qd: minus_potential(0.5 * qd @ system.mass_matrix(q) @ qd, system.potential, q)
 
 
-def dynamics(system: ExplicitSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """Returns all functions of the system; the forward model solves M qdd = tau - tau(q, qd, 0)."""
+def functions(system: ExplicitSystem) -> Functions:
+    """Returns the functions of the system; the forward model solves M qdd = tau - tau(q, qd, 0)."""
 
     def accelerate(q: Vector, qd: Vector, tau: Vector) -> Vector:
         return elimination.solve(system.mass_matrix(q), tau - system.forces(q, qd, jnp.zeros_like(qd)))
@@ -85,12 +84,5 @@ def dynamics(system: ExplicitSystem, *, degrees_of_freedom: int | None = None) -
     def energy(q: Vector, qd: Vector) -> Scalar:
         return plus_potential(0.5 * qd @ system.mass_matrix(q) @ qd, system.potential, q)
 
-    return make_dynamics(
-        system,
-        system.forces,
-        accelerate,
-        system.decompose or partial(decompose_by_differences, system.forces),
-        energy,
-        lambda q, qd: system.mass_matrix(q),
-        degrees_of_freedom=degrees_of_freedom,
-    )
+    decompose = system.decompose or partial(decompose_by_differences, system.forces)
+    return system.forces, accelerate, energy, lambda q, qd: system.mass_matrix(q), decompose

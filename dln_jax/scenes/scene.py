@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from dln_jax.mechanics import explicit
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.explicit import ExplicitSystem
 from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape, joint_dissipation
 from dln_jax.mechanics.joint_friction import sum_of
@@ -80,7 +81,7 @@ def textbook(
 
 def closed_form_forward_dynamics(scene: Scene, q: Vector, qd: Vector, tau: Vector) -> Vector:
     """Returns the acceleration qdd [d] by textbook formulas and LAPACK; the last digits of datasets depend on them."""
-    bias = explicit.dynamics(scene.closed_form).inverse_dynamics(q, qd, jnp.zeros_like(qd))
+    bias = dynamics(scene.closed_form).inverse_dynamics(q, qd, jnp.zeros_like(qd))
     return jnp.linalg.solve(scene.mass_matrix(q), tau - bias)
 
 

@@ -13,7 +13,7 @@ from jax import Array
 
 from dln_jax.files import is_file
 from dln_jax.mechanics import equations
-from dln_jax.mechanics.dynamics import Dynamics, Flow, InverseForward, PhaseRates, PlainDynamics
+from dln_jax.mechanics.dynamics import Dynamics, Flow, InverseForward, PhaseRates
 from dln_jax.models import uncertainty as uncertainties
 from dln_jax.models.baselines import Derivatives, FunctionModel
 from dln_jax.models.latent_phase import ImageModel, LatentPhase
@@ -37,7 +37,7 @@ from dln_jax.zoo.parameter_files import (
 if TYPE_CHECKING:
     from dln_jax.zoo.value_functions import ValueRun
 
-Functions = TypeVar("Functions", bound=Dynamics | PlainDynamics | Flow | PhaseRates)
+Functions = TypeVar("Functions", bound=Dynamics | InverseForward | Flow | PhaseRates)
 AnyModel = Model | FunctionModel | ImageModel
 
 
@@ -75,7 +75,7 @@ class Run:
         return self._of("energies", Model).energies(self.parameters)
 
     @functools.cached_property
-    def dynamics(self) -> Dynamics | PlainDynamics:
+    def dynamics(self) -> Dynamics | InverseForward:
         """Functions of coordinates and velocities. Raises InputError for a model that has none."""
         return self._compiled("dynamics", equations.dynamics, PhaseRates)
 

@@ -26,7 +26,8 @@ from dln_jax.control.optimal.fitted import Iteration
 from dln_jax.control.optimal.flow import limits
 from dln_jax.control.optimal.problem import ControlProblem, from_plant, rates
 from dln_jax.control.state_space import Law, circular, error
-from dln_jax.mechanics.explicit import ExplicitSystem, closed_form, dynamics
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.explicit import ExplicitSystem, closed_form
 from dln_jax.mechanics.integrators import Method, explicit_euler
 from dln_jax.nn.activations import softplus
 from dln_jax.scenes.pendulums import cart_pole, rotary_pendulum
