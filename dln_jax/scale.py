@@ -18,7 +18,7 @@ import re
 import socket
 import statistics
 import threading
-import time
+import timeit
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -405,20 +405,17 @@ def double_precision_cost(rows: int = 2048) -> float:
     Args:
         rows: size of the square matrices; 2048 rows take 17 GFlop, enough to fill any device.
     """
-    seconds = {}
+
+    def seconds(dtype: Any) -> float:
+        square = jnp.ones((rows, rows), dtype) / rows
+        # "highest" keeps float32 from being computed in fewer bits on tensor cores.
+        product = jax.jit(lambda x: jnp.matmul(x, x, precision="highest")).lower(square).compile()
+        jax.block_until_ready(product(square))
+        times = timeit.repeat(lambda: jax.block_until_ready(product(square)), number=1, repeat=REPETITIONS)
+        return statistics.median(times)
+
     with jax.enable_x64(True):
-        for dtype in (jnp.float32, jnp.float64):
-            square = jnp.ones((rows, rows), dtype) / rows
-            # "highest" keeps float32 from being computed in fewer bits on tensor cores.
-            product = jax.jit(lambda x: jnp.matmul(x, x, precision="highest")).lower(square).compile()
-            jax.block_until_ready(product(square))
-            times = []
-            for _ in range(REPETITIONS):
-                began = time.perf_counter()
-                jax.block_until_ready(product(square))
-                times.append(time.perf_counter() - began)
-            seconds[dtype] = statistics.median(times)
-    return seconds[jnp.float64] / seconds[jnp.float32]
+        return seconds(jnp.float64) / seconds(jnp.float32)
 
 
 def device_lines(precision: str) -> list[str]:

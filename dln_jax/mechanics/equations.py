@@ -16,6 +16,7 @@ All energies have both dynamics and flow; `InverseForward` has dynamics only, `P
 
 from typing import Any, get_args, overload
 
+import jax
 import jax.numpy as jnp
 
 from dln_jax.mechanics import explicit, hamiltonian, lagrangian, natural
@@ -143,10 +144,8 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pha
     H = hamiltonian_of(system)
 
     def hamilton(q, p):
-        if isinstance(system, LoadedSystem):
-            qd = hamiltonian.velocity(H, q, p)
-            return hamiltonian.time_derivative(H, q, p, driving_force(system, q, qd, jnp.zeros_like(q)))
-        return hamiltonian.time_derivative(H, q, p, jnp.zeros_like(q), dissipation=system.dissipation)
+        force, qd = jax.grad(H, argnums=(0, 1))(q, p)
+        return qd, driving_force(system, q, qd, jnp.zeros_like(q)) - force
 
     return Flow(lambda q, p: answer(hamilton, *vectors(d, q=q, p=p)), lambda q, p: answer(H, *vectors(d, q=q, p=p)))
 

@@ -200,10 +200,14 @@ def rollout(step: Step, state: State, t: Float[Array | np.ndarray, " T"], *, sub
     times = jnp.asarray(t, jnp.result_type(*jax.tree.leaves(state)))
 
     def interval(state, start_and_duration):
-        start, duration = start_and_duration
-        return advance(step, start, state, duration, substeps=substeps), None
+        return advance(step, start_and_duration[0], state, start_and_duration[1], substeps=substeps)
 
-    _, later = steps_in_turn(interval, state, (times[:-1], jnp.diff(times)))
+    return from_start(interval, state, (times[:-1], jnp.diff(times)))
+
+
+def from_start(step: Callable[[State, Any], State], state: State, inputs: Any) -> State:
+    """Returns a state and those after each step (state, input) -> state; leaves get a leading axis."""
+    _, later = steps_in_turn(lambda state, input: (step(state, input), None), state, inputs)
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state, later)
 
 

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from dln_jax.mechanics.dynamics import InverseForward, friction_force
+from dln_jax.mechanics.dynamics import InverseForward, friction_of
 from dln_jax.mechanics.equations import Driven, Energies, dynamics
 from dln_jax.mechanics.explicit import ExplicitSystem
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
@@ -42,9 +42,8 @@ def inverse_dynamics_jacobians(system: Driven, q: Vector, qd: Vector, qdd: Vecto
     if not isinstance(system, Natural):
         return jax.jacrev(motion.inverse_dynamics, argnums=(0, 1, 2))(q, qd, qdd)
     tau_q, tau_qd, mass = _natural_jacobians(system, lambda q: motion.inverse_dynamics(q, qd, qdd), q, qd)
-    if system.dissipation is not None:
-        D = system.dissipation
-        tau_qd += jax.jacfwd(lambda velocity: friction_force(D, q, velocity))(qd)
+    if (friction := friction_of(system)) is not None:
+        tau_qd += jax.jacfwd(friction, argnums=1)(q, qd)
     return tau_q, tau_qd, mass
 
 

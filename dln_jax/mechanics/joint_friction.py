@@ -22,7 +22,7 @@ from jax import Array
 
 from dln_jax.mechanics.dynamics import InverseForward, PhaseRates, friction_force
 from dln_jax.mechanics.friction import joint_rates
-from dln_jax.types import Dissipation, Potential, Scalar, Vector
+from dln_jax.types import Dissipation, Potential, Vector
 
 
 class Load(NamedTuple):
@@ -75,15 +75,9 @@ def with_friction(system: Any, dissipation: Dissipation | None, load: Load | Non
     return LoadedSystem(_dissipating(system, None), load, system.dissipation)
 
 
-def sum_of(first: Dissipation | None, second: Dissipation) -> Dissipation:
-    """Returns the sum of two Rayleigh functions."""
-    if first is None:
-        return second
-
-    def both(q: Vector, qd: Vector) -> Scalar:
-        return first(q, qd) + second(q, qd)
-
-    return both
+def sum_of(first: Callable[..., Array] | None, second: Callable[..., Array]) -> Callable[..., Array]:
+    """Returns the sum of two functions of a state; an absent one is never traced."""
+    return second if first is None else lambda *state: first(*state) + second(*state)
 
 
 def carrying(load: Load, qd: Vector, tau_link: Vector) -> Vector:

@@ -237,8 +237,7 @@ def read_description(directory: Path) -> Description:
 
 def compiled(functions: Functions, dtype: Any) -> Functions:
     """Jits the functions and converts numbers in their arguments to one dtype."""
-    jitted = {name: _jitted(function, dtype) for name, function in functions._asdict().items() if function is not None}
-    return functions._replace(**jitted)
+    return jax.tree.map(lambda function: _jitted(function, dtype), functions)
 
 
 def _jitted(function: Callable[..., Any], dtype: Any) -> Any:

@@ -179,8 +179,7 @@ def make_program(structure: Structure, *, ridge: float) -> Program:
         at = project(structure, frames, samples, unit, ridge=ridge)
         lower = at.loss < state.at.loss  # false for NaN
         damping = jnp.clip(state.damping * jnp.where(lower, FEWER, MORE), LEAST_DAMPING, MOST_DAMPING)
-        before = (state.frames, state.at)
-        frames, at = jax.tree.map(lambda new, old: jnp.where(lower, new, old), (frames, at), before)
+        frames, at = jax.tree.map(lambda new, old: jnp.where(lower, new, old), (frames, at), state[:2])
         return Descent(frames, at, damping)
 
     def iterate(state: Descent, samples: Samples, unit: Array) -> Descent:
@@ -200,7 +199,7 @@ def descend(
     expired: Callable[[], bool] = lambda: False,
 ) -> Descent:
     """Iterates until the loss settles, no step descends, or the iterations or the time are used up."""
-    samples, unit = jax.tree.map(jnp.asarray, samples), jnp.asarray(unit)
+    samples, unit = jax.tree.map(jnp.asarray, (samples, unit))
     directions = len(free_directions(structure.parents, structure.joints))
     # The first iteration only evaluates the frames: without a slope there is no step.
     at = Projection(

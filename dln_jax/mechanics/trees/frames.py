@@ -31,9 +31,8 @@ class Placed(NamedTuple):
 
 def aligned(tree: Tree) -> Tree:
     """Returns the same bodies and joints in frames whose joint axis is z; frames and payloads of links change."""
-    if not isinstance(tree.axes, np.ndarray) or np.array_equal(
-        tree.axes, np.tile([0.0, 0.0, 1.0], (len(tree.axes), 1))
-    ):
+    about_z = np.tile([0.0, 0.0, 1.0], (len(tree.axes), 1))
+    if not isinstance(tree.axes, np.ndarray) or np.array_equal(tree.axes, about_z):
         return tree
     turns = [_onto(axis) for axis in tree.axes]
     rotations, positions = [], []
@@ -46,8 +45,7 @@ def aligned(tree: Tree) -> Tree:
     inertias = [moved(theta, turn.T, np.zeros(3)) for theta, turn in zip(tree.inertias, turns, strict=True)]
     numpy = np if all(isinstance(part, np.ndarray) for part in (*rotations, *positions, *inertias)) else jnp
     rotations, positions, inertias = (numpy.stack(parts) for parts in (rotations, positions, inertias))
-    axes = np.tile([0.0, 0.0, 1.0], (len(turns), 1))
-    return tree._replace(rotations=rotations, positions=positions, inertias=inertias, axes=axes)
+    return tree._replace(rotations=rotations, positions=positions, inertias=inertias, axes=about_z)
 
 
 def _onto(axis: np.ndarray) -> np.ndarray:
@@ -107,13 +105,14 @@ def _product(matrix: Any, vector: Vector3) -> list[Any]:
 def cross(a: Any, b: Any) -> Vector3:
     """Returns a x b, without terms that are known to be zero."""
 
+    def product(x: Any, y: Any) -> Any:
+        return None if _is_zero(x) or _is_zero(y) else x * y
+
     def difference(i: int, j: int) -> Any:
-        terms = [(1, a[i], b[j]), (-1, a[j], b[i])]
-        kept = [(sign, x, y) for sign, x, y in terms if not (_is_zero(x) or _is_zero(y))]
-        if not kept:
-            return 0.0
-        total = kept[0][0] * (kept[0][1] * kept[0][2]) if kept[0][0] > 0 else -(kept[0][1] * kept[0][2])
-        return total - kept[1][1] * kept[1][2] if len(kept) == 2 else total
+        plus, minus = product(a[i], b[j]), product(a[j], b[i])
+        if minus is None:
+            return 0.0 if plus is None else plus
+        return -minus if plus is None else plus - minus
 
     return jnp.stack([jnp.asarray(difference(*pair)) for pair in ((1, 2), (2, 0), (0, 1))])
 
