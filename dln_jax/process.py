@@ -39,12 +39,6 @@ def is_command() -> bool:
     return script or (package == "dln_jax" and not name) or Path(sys.argv[0]).stem == "dln-jax"
 
 
-def terminate_as_interrupt() -> None:
-    """Makes SIGTERM end this process as Ctrl-C does, unless SIGTERM is already handled or ignored."""
-    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-
-
 @contextlib.contextmanager
 def held_back() -> Iterator[None]:
     """Delays SIGINT and SIGTERM to the end of the block, such as a training step and its checkpoint.
@@ -111,5 +105,6 @@ def seconds_left(until: float) -> float:
 
 if is_command():
     sys.excepthook = in_a_word
-    terminate_as_interrupt()
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:  # SIGTERM ends a command as Ctrl-C does
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     open_standard_streams()

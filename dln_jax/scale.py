@@ -18,11 +18,11 @@ import re
 import socket
 import statistics
 import threading
-import time
+import timeit
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -214,13 +214,8 @@ def _placed(tree: Any, sharding: NamedSharding) -> Any:
     return jax.tree.map(place, tree)
 
 
-class Membership(NamedTuple):
-    """How a process joins others; if all fields are `None`, JAX reads them from the cluster's variables."""
-
-    coordinator: str | None = None
-    """host:port of process 0."""
-    processes: int | None = None
-    process: int | None = None
+Membership = tuple[str | None, int | None, int | None]
+"""host:port of process 0, number of processes, and index of this one; if all are `None`, the cluster states them."""
 
 
 def host_devices(count: int | None) -> None:
@@ -256,7 +251,7 @@ def membership(
             raise InputError("--processes is 1, which needs no --coordinator and no --process-id; leave them out")
         return None
     if len(absent) == len(options):
-        return Membership() if any(environ.get(name, "1") != "1" for name in _TASKS) else None
+        return (None, None, None) if any(environ.get(name, "1") != "1" for name in _TASKS) else None
     if processes is None or coordinator is None or process is None:
         present = " and ".join(option for option in options if option not in absent)
         raise InputError(f"{' and '.join(absent)} missing beside {present}; give all three, or none for one process")
@@ -265,7 +260,7 @@ def membership(
     parts = _ADDRESS.fullmatch(coordinator)
     if not parts or not coordinator.isascii() or not 0 < int(parts[2]) < 2**16:
         raise InputError(f"--coordinator is {coordinator!r:.80}; expected host:port, such as node1:61440")
-    return Membership(coordinator, processes, process)
+    return coordinator, processes, process
 
 
 def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINING) -> None:
@@ -280,8 +275,9 @@ def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINI
         InputError: the address cannot be used, a process is missing, or two differ. JAX may go on connecting in a
             thread, so that the caller should end the process at once.
     """
-    where = member.coordinator or "the cluster"
-    claim = _claimed_address(member)
+    coordinator, processes, process = member
+    where = coordinator or "the cluster"
+    claim = _claimed_address(coordinator, process)
     # JAX's handler of SIGTERM would keep a process alive that is asked to end.
     jax.config.update("jax_enable_preemption_service", False)
     errors = []
@@ -303,7 +299,7 @@ def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINI
     thread.join(seconds)
     claim.close()
     if thread.is_alive():
-        count = "the processes" if member.processes is None else f"the {member.processes} processes"
+        count = "the processes" if processes is None else f"the {processes} processes"
         raise InputError(
             f"{count} did not meet at {where} within {seconds} s; start the same command once for each --process-id, "
             "with an address of process 0's host that all can reach"
@@ -318,18 +314,18 @@ def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINI
         print(f"{jax.process_count()} processes, {local} {kind} device{'s' * (local > 1)} each")
 
 
-def _claimed_address(member: Membership) -> contextlib.ExitStack:
+def _claimed_address(coordinator: str | None, process: int | None) -> contextlib.ExitStack:
     """Returns what keeps other processes 0 away until it is closed.
 
     Raises:
         InputError: the host has no address, or the port is not free; JAX would wait in both cases.
     """
-    if member.coordinator is None:
+    if coordinator is None:
         return contextlib.ExitStack()
-    host, _, port = member.coordinator.rpartition(":")
+    host, _, port = coordinator.rpartition(":")
     try:
         with contextlib.ExitStack() as claim:
-            if member.process:
+            if process:
                 socket.getaddrinfo(host.strip("[]"), int(port))
             else:
                 # JAX's servers share a port, and a process that finds another of its index aborts. The UDP port has one
@@ -338,7 +334,7 @@ def _claimed_address(member: Membership) -> contextlib.ExitStack:
                 socket.create_server(("", int(port))).close()
             return claim.pop_all()
     except socket.gaierror as error:
-        raise InputError(f"cannot reach {member.coordinator} ({error.strerror}); check --coordinator") from None
+        raise InputError(f"cannot reach {coordinator} ({error.strerror}); check --coordinator") from None
     except OSError as error:
         raise InputError(f"port {port} of --coordinator is not free ({error.strerror}); choose another") from None
 
@@ -409,20 +405,17 @@ def double_precision_cost(rows: int = 2048) -> float:
     Args:
         rows: size of the square matrices; 2048 rows take 17 GFlop, enough to fill any device.
     """
-    seconds = {}
+
+    def seconds(dtype: Any) -> float:
+        square = jnp.ones((rows, rows), dtype) / rows
+        # "highest" keeps float32 from being computed in fewer bits on tensor cores.
+        product = jax.jit(lambda x: jnp.matmul(x, x, precision="highest")).lower(square).compile()
+        jax.block_until_ready(product(square))
+        times = timeit.repeat(lambda: jax.block_until_ready(product(square)), number=1, repeat=REPETITIONS)
+        return statistics.median(times)
+
     with jax.enable_x64(True):
-        for dtype in (jnp.float32, jnp.float64):
-            square = jnp.ones((rows, rows), dtype) / rows
-            # "highest" keeps float32 from being computed in fewer bits on tensor cores.
-            product = jax.jit(lambda x: jnp.matmul(x, x, precision="highest")).lower(square).compile()
-            jax.block_until_ready(product(square))
-            times = []
-            for _ in range(REPETITIONS):
-                began = time.perf_counter()
-                jax.block_until_ready(product(square))
-                times.append(time.perf_counter() - began)
-            seconds[dtype] = statistics.median(times)
-    return seconds[jnp.float64] / seconds[jnp.float32]
+        return seconds(jnp.float64) / seconds(jnp.float32)
 
 
 def device_lines(precision: str) -> list[str]:

@@ -21,7 +21,7 @@ from dln_jax.control.plants.estimators import Estimator, by_differences
 from dln_jax.control.plants.plant import Layout, Plant, layout, plant_of
 from dln_jax.control.state_space import field_of
 from dln_jax.control.swing_up import SwingUp, SwingUpNumbers, Upright, swing_up, upright_of
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape
 from dln_jax.scenes.pendulums import cart_pole, rotary_pendulum
@@ -136,7 +136,7 @@ def simulated_plant(plant: DesktopPlant, *, seed: int = 0) -> Plant:
     )  # fmt: skip
 
 
-def law_of(plant: DesktopPlant, model: Dynamics | PlainDynamics, estimator: Estimator | None = None) -> SwingUp:
+def law_of(plant: DesktopPlant, model: Dynamics | InverseForward, estimator: Estimator | None = None) -> SwingUp:
     """Returns the plant's swing-up by a model, by default with rates from differences; raises as `swing_up`."""
     needs, hardware = plant.scene.needs, plant.hardware
     return swing_up(
@@ -145,7 +145,7 @@ def law_of(plant: DesktopPlant, model: Dynamics | PlainDynamics, estimator: Esti
     )  # fmt: skip
 
 
-def upright_for(plant: DesktopPlant, model: Dynamics | PlainDynamics) -> Upright:
+def upright_for(plant: DesktopPlant, model: Dynamics | InverseForward) -> Upright:
     """Returns the checked model with its equilibrium near the goal; raises as `swing_up`."""
     return upright_of(
         model, plant.scene.needs.actuation, np.zeros(2), postures=_circle(), lower=plant.hardware.lower,
@@ -160,7 +160,7 @@ def _circle() -> np.ndarray:
 
 def motion_of(
     plant: DesktopPlant,
-    model: Dynamics | PlainDynamics,
+    model: Dynamics | InverseForward,
     *,
     seconds: float = SECONDS,
     estimator: Estimator | None = None,
@@ -182,7 +182,7 @@ def motion_of(
 
 def try_starts(
     plant: DesktopPlant,
-    model: Dynamics | PlainDynamics,
+    model: Dynamics | InverseForward,
     *,
     starts: int = 1000,
     seed: int = 0,

@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from dln_jax.control.state_space import where_finite
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.solvers.elimination import solve
 from dln_jax.types import InputError, Scalar, Vector
 
@@ -88,7 +88,7 @@ def passive_energy(plant: Dynamics, parts: Parts, goal: Any) -> Callable[[Vector
 
 
 def energy_shaping(
-    plant: Dynamics | PlainDynamics,
+    plant: Dynamics | InverseForward,
     parts: Parts,
     goal: Sequence[float] | Array,
     gains: EnergyGains,
@@ -125,7 +125,7 @@ def energy_shaping(
     return law
 
 
-def with_energy(model: Dynamics | PlainDynamics) -> Dynamics:
+def with_energy(model: Dynamics | InverseForward) -> Dynamics:
     """Returns the model if it has an energy; raises `InputError` otherwise."""
     if not isinstance(model, Dynamics):
         raise InputError("the model has no energy for an energy law to shape; train one that has, such as a DeLaN")

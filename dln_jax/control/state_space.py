@@ -12,8 +12,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
-from dln_jax.mechanics.integrators import CLASSICAL, Tableau, advance, runge_kutta
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
+from dln_jax.mechanics.integrators import Method, advance, rk4
 from dln_jax.types import InputError, JointKind, Vector, require_positive
 
 Field = Callable[[Array, Array], Array]
@@ -31,7 +31,7 @@ class Linearisation(NamedTuple):
     u: Vector
 
 
-def field_of(plant: Dynamics | PlainDynamics, actuation: Any = None) -> Field:
+def field_of(plant: Dynamics | InverseForward, actuation: Any = None) -> Field:
     """Returns the field of a mechanical system, on x = (q, qd) [2 d] and the controls u [m].
 
     Args:
@@ -47,9 +47,7 @@ def field_of(plant: Dynamics | PlainDynamics, actuation: Any = None) -> Field:
     return field
 
 
-def integrated(
-    field: Field, dt: float, *, method: Tableau = CLASSICAL, substeps: int = 1
-) -> Callable[[Array, Array], Array]:
+def integrated(field: Field, dt: float, *, method: Method = rk4, substeps: int = 1) -> Callable[[Array, Array], Array]:
     """Returns (x, u) -> x after dt with u held, for a sampled controller or a `TrajectoryProblem`; differentiable.
 
     A step of an implicit method is NaN if its equations are not solved. It is differentiated by the implicit function
@@ -58,7 +56,7 @@ def integrated(
     Args:
         field: (x, u) -> dx/dt.
         dt: s.
-        method: Runge-Kutta tableau, such as `integrators.MIDPOINT` or `RADAU_3` for a stiff plant.
+        method: one of `mechanics.integrators`, such as `implicit_midpoint` or `radau3` for a stiff plant.
         substeps: steps of the method within dt.
 
     Raises:
@@ -67,7 +65,7 @@ def integrated(
     require_positive(dt=dt, substeps=substeps)
 
     def step(x: Array, u: Array) -> Array:
-        return advance(runge_kutta(method, lambda t, state: field(state, u)), 0.0, x, dt, substeps=substeps)
+        return advance(method(lambda t, state: field(state, u)), 0.0, x, dt, substeps=substeps)
 
     return step
 

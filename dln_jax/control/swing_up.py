@@ -23,7 +23,7 @@ from dln_jax.control.energy_shaping import EnergyGains, Parts, energy_shaping, p
 from dln_jax.control.regulators import Regulator, lqr, regulated, switched, value
 from dln_jax.control.state_space import Law, Linearisation, field_of, holding_controls, linearise
 from dln_jax.control.tracking import GAIN, definite, friction_compensation, without_friction
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.types import InputError, JointKind, Vector
 
 NEWTON_STEPS = 20
@@ -108,7 +108,7 @@ def nearest_equilibrium(plant: Dynamics, goal: Any, passive: Sequence[int]) -> V
 
 
 def swing_up(
-    model: Dynamics | PlainDynamics,
+    model: Dynamics | InverseForward,
     actuation: Any,
     joints: tuple[JointKind, ...],
     goal: Any,
@@ -148,7 +148,7 @@ def swing_up(
 
 
 def upright_of(
-    model: Dynamics | PlainDynamics,
+    model: Dynamics | InverseForward,
     actuation: Any,
     goal: Any,
     *,

@@ -31,7 +31,7 @@ from jaxtyping import Bool, Float
 
 from dln_jax.control.state_space import where_finite
 from dln_jax.data.schema import Trajectories
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.solvers.lapack import cholesky
 from dln_jax.types import InputError, Vector, require_positive
 
@@ -67,7 +67,7 @@ def feedback(gains: Gains, q: Any, qd: Any, wanted: Reference) -> Array:
     return _times(gains.proportional, wanted.q - q) + _times(gains.derivative, wanted.qd - qd)
 
 
-def gravity_compensation(plant: Dynamics | PlainDynamics, gains: Gains) -> Tracker:
+def gravity_compensation(plant: Dynamics | InverseForward, gains: Gains) -> Tracker:
     """Returns the law of gravity at the present posture plus feedback: exact at rest."""
 
     def law(q: Vector, qd: Vector, wanted: Reference) -> Array:
@@ -77,7 +77,7 @@ def gravity_compensation(plant: Dynamics | PlainDynamics, gains: Gains) -> Track
     return law
 
 
-def feed_forward(plant: Dynamics | PlainDynamics, gains: Gains) -> Tracker:
+def feed_forward(plant: Dynamics | InverseForward, gains: Gains) -> Tracker:
     """Returns the law of the model's torque on the reference plus feedback, without the model at the measured state."""
 
     def law(q: Vector, qd: Vector, wanted: Reference) -> Array:
@@ -87,7 +87,7 @@ def feed_forward(plant: Dynamics | PlainDynamics, gains: Gains) -> Tracker:
     return law
 
 
-def computed_torque(plant: Dynamics | PlainDynamics, gains: Gains) -> Tracker:
+def computed_torque(plant: Dynamics | InverseForward, gains: Gains) -> Tracker:
     """Returns the law of the model's torque for the reference acceleration plus feedback.
 
     With an exact model, and gains [d] or matrices in 1/s² and 1/s, the error obeys e'' + D e' + P e = 0.

@@ -43,7 +43,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import window_indices
 from dln_jax.learning.engine.problem import Problem, arrays_of, selected_by
 from dln_jax.mechanics.discrete import Torque, driven, torque_slopes
-from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainDynamics, PlainFlow
+from dln_jax.mechanics.dynamics import Dynamics, Flow, InverseForward, PhaseRates
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.integrators import looped_rk4, rk4, rollout
 from dln_jax.models.model import Model, Parameters
@@ -103,7 +103,7 @@ class Weights(NamedTuple):
 
 
 def phase_motion(
-    field: Flow | PlainFlow, start: Array, t: Float[Array, " T"], *, substeps: int
+    field: Flow | PhaseRates, start: Array, t: Float[Array, " T"], *, substeps: int
 ) -> Float[Array, "T two_d"]:
     """States (q, p) at the times t from `start` [2 d], by RK4."""
     first = tuple(jnp.split(start, 2))
@@ -230,7 +230,7 @@ class Gauge(NamedTuple):
 
 
 def motion(
-    system: Dynamics | PlainDynamics,
+    system: Dynamics | InverseForward,
     start: Float[Array, " two_d"],
     t: Float[Array, " T"],
     tau: Float[Array, "T d"] | None = None,
@@ -289,7 +289,7 @@ def measured_problem(
         _, q, qd, *_ = window
         return jnp.concatenate([q[0], qd[0], *([] if noise.tau is None else [jnp.zeros(d)])])
 
-    def error(system: Dynamics | PlainDynamics, window: tuple[Array, ...], start: Array) -> Array:
+    def error(system: Dynamics | InverseForward, window: tuple[Array, ...], start: Array) -> Array:
         t, q, qd, tau, weight = window
         push = start[2 * d :]
         states = motion(
@@ -326,7 +326,7 @@ def check_gauge(gauge: Gauge | None, tau: np.ndarray, d: int) -> None:
         raise InputError(f"the gauge has {len(gauge.q)} coordinates, the data {d}; make them agree")
 
 
-def gauge_error(system: Dynamics | PlainDynamics, gauge: Gauge | None) -> Float[Array, " n"]:
+def gauge_error(system: Dynamics | InverseForward, gauge: Gauge | None) -> Float[Array, " n"]:
     """Distance of the mass matrix from the gauge, in units of `GAUGE_TOLERANCE` [1]; empty without either."""
     if gauge is None or not isinstance(system, Dynamics):
         return jnp.zeros(0)

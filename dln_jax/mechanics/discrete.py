@@ -22,8 +22,7 @@ from jaxtyping import Float
 
 from dln_jax.mechanics import integrators
 from dln_jax.mechanics.dynamics import Rates
-from dln_jax.mechanics.integrators import Field, State, advance
-from dln_jax.rollout import rollout
+from dln_jax.mechanics.integrators import Method, State, advance, from_start
 from dln_jax.solvers.elimination import solve
 from dln_jax.types import InputError, require_positive
 
@@ -141,7 +140,7 @@ def driven(
     durations: Array,
     *,
     substeps: int,
-    method: Callable[[Field], integrators.Step] = integrators.rk4,
+    method: Method = integrators.rk4,
 ) -> State:
     """Integrates y' = rate(y, tau(t)) and returns the states at the samples; leaves get a leading axis T.
 
@@ -154,13 +153,12 @@ def driven(
         method: field -> step; `integrators.looped_rk4` compiles faster.
     """
 
-    def interval(state: State, drive: tuple[Array, Array, Array]) -> tuple[State, None]:
+    def interval(state: State, drive: tuple[Array, Array, Array]) -> State:
         tau, slope, duration = drive
         step = method(lambda s, state: rate(state, tau + s * slope))
-        return advance(step, jnp.zeros_like(duration), state, duration, substeps=substeps), None
+        return advance(step, jnp.zeros_like(duration), state, duration, substeps=substeps)
 
-    _, later = rollout(interval, start, (tau, slopes, durations))
-    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, later)
+    return from_start(interval, start, (tau, slopes, durations))
 
 
 def _force(actuation: Actuation, u: Array) -> Array:

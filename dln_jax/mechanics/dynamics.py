@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from dln_jax.mechanics.arguments import answer, vectors
+from dln_jax.mechanics.arguments import vectors
 from dln_jax.types import Dissipation, Hamiltonian, Potential, Scalar, Vector, VectorLike
 
 
@@ -46,17 +46,6 @@ class Dynamics(NamedTuple):
     """(q, qd) -> friction force dD/dqd [d]; zero without friction."""
 
 
-class PlainDynamics(NamedTuple):
-    """Functions of a system without energy and mass matrix; otherwise like `Dynamics`."""
-
-    inverse_dynamics: Callable[[VectorLike, VectorLike, VectorLike], Array]
-    """(q, qd, qdd) -> tau [d]."""
-    forward_dynamics: Callable[[VectorLike, VectorLike, VectorLike], Array]
-    """(q, qd, tau) -> qdd [d]."""
-    decompose: Callable[[VectorLike, VectorLike, VectorLike], Decomposition]
-    """(q, qd, qdd) -> inertial, Coriolis and gravity forces; friction counts as Coriolis force."""
-
-
 Rates = Callable[[VectorLike, VectorLike], tuple[Array, Array]]
 """(q, p) -> (qd, pd), both [d]."""
 
@@ -69,87 +58,32 @@ class Flow(NamedTuple):
     """(q, p) -> H, scalar."""
 
 
-class PlainFlow(NamedTuple):
-    """Flow of a system without energy."""
-
-    rates: Rates
-
-
 class InverseForward(NamedTuple):
     """A system without energy: two functions of one state that need not be inverses of each other."""
 
-    inverse_dynamics: Callable[[Array, Array, Array], Array]
+    inverse_dynamics: Callable[..., Array]
     """(q, qd, qdd) -> tau [d]."""
-    forward_dynamics: Callable[[Array, Array, Array], Array]
+    forward_dynamics: Callable[..., Array]
     """(q, qd, tau) -> qdd [d]."""
+
+    def decompose(self, q: VectorLike, qd: VectorLike, qdd: VectorLike) -> Decomposition:
+        """Returns inertial, Coriolis and gravity forces; friction counts as Coriolis force."""
+        return decompose_by_differences(self.inverse_dynamics, *vectors(q=q, qd=qd, qdd=qdd))
 
 
 class PhaseRates(NamedTuple):
     """Rates of a state in a phase space."""
 
-    rates: Callable[[Array, Array], tuple[Array, Array]]
+    rates: Callable[..., tuple[Array, Array]]
     """(q, p) -> (qd, pd), both [d]."""
     hamiltonian: Hamiltonian | None = None
     """(q, p) -> energy of a part of the field; `None` for a field without energy."""
 
 
-def make_dynamics(
-    system: Any,
-    inverse_dynamics: Callable[..., Array],
-    forward_dynamics: Callable[..., Array],
-    decompose: Callable[..., Decomposition],
-    energy: Callable[..., Array],
-    mass_matrix: Callable[..., Array],
-    *,
-    degrees_of_freedom: int | None = None,
-) -> Dynamics:
-    """Builds `Dynamics` from frictionless functions of vectors [d] of one type, and the friction of a record.
-
-    Its functions convert or refuse their arguments; without `degrees_of_freedom` the arguments of a call need only
-    agree with one another. `mass_matrix` is called with both q and qd.
-    """
-    d, force = degrees_of_freedom, friction_of(system)
-
-    def inverse_with_friction(q: Vector, qd: Vector, qdd: Vector) -> Vector:
-        tau = inverse_dynamics(q, qd, qdd)
-        return tau if force is None else tau + force(q, qd)
-
-    def forward_with_friction(q: Vector, qd: Vector, tau: Vector) -> Vector:
-        return forward_dynamics(q, qd, tau if force is None else tau - force(q, qd))
-
-    def mass_matrix_or_at_rest(q, qd=None):
-        if qd is None:
-            (q,) = vectors(d, q=q)
-            return answer(mass_matrix, q, jnp.zeros_like(q))
-        return answer(mass_matrix, *vectors(d, q=q, qd=qd))
-
-    def friction(q, qd):
-        q, qd = vectors(d, q=q, qd=qd)
-        return jnp.zeros_like(qd) if force is None else answer(force, q, qd)
-
-    plain = make_plain_dynamics(inverse_with_friction, forward_with_friction, decompose, degrees_of_freedom=d)
-    return Dynamics(
-        **plain._asdict(),
-        energy=lambda q, qd: answer(energy, *vectors(d, q=q, qd=qd)),
-        mass_matrix=mass_matrix_or_at_rest,
-        friction=friction,
-    )
-
-
-def make_plain_dynamics(
-    inverse_dynamics: Callable[..., Array],
-    forward_dynamics: Callable[..., Array],
-    decompose: Callable[..., Decomposition],
-    *,
-    degrees_of_freedom: int | None = None,
-) -> PlainDynamics:
-    """Builds dynamics without an energy; its functions convert or refuse their arguments."""
-    d = degrees_of_freedom
-    return PlainDynamics(
-        lambda q, qd, qdd: answer(inverse_dynamics, *vectors(d, q=q, qd=qd, qdd=qdd)),
-        lambda q, qd, tau: answer(forward_dynamics, *vectors(d, q=q, qd=qd, tau=tau)),
-        lambda q, qd, qdd: answer(decompose, *vectors(d, q=q, qd=qd, qdd=qdd)),
-    )
+Functions = tuple[
+    Callable[..., Array], Callable[..., Array], Callable[..., Array], Callable[..., Array], Callable[..., Decomposition]
+]
+"""The first five of `Dynamics`, of vectors [d] of one type, without friction; `mass_matrix` takes both q and qd."""
 
 
 def plus_potential(kinetic: Scalar, V: Potential | None, q: Vector) -> Scalar:

@@ -4,8 +4,7 @@
 |---|---|---|
 | `NaturalSystem` | factor of M, V, D | `mechanics.natural` |
 | `NaturalHamiltonian` | factor of M⁻¹, V, D | `mechanics.natural` |
-| `ClosedForm` | M, V, D, and the resulting forces | `mechanics.closed_form` |
-| `RecursiveSystem` | M, V, D, and all forces by a recursion | `mechanics.closed_form` |
+| `ExplicitSystem` | M, V, D, and the resulting forces | `mechanics.explicit` |
 | `LagrangianSystem` | L, D | `mechanics.lagrangian` |
 | `HamiltonianSystem` | H, D | `mechanics.hamiltonian` |
 | `LoadedSystem` | any of these, and load-dependent friction | `mechanics.joint_friction` |
@@ -15,67 +14,41 @@
 All energies have both dynamics and flow; `InverseForward` has dynamics only, `PhaseRates` a flow only.
 """
 
-from functools import partial
-from typing import Any, overload
+from typing import Any, get_args, overload
 
+import jax
 import jax.numpy as jnp
 
-from dln_jax.mechanics import closed_form, hamiltonian, lagrangian, natural
+from dln_jax.mechanics import explicit, hamiltonian, lagrangian, natural
 from dln_jax.mechanics.arguments import answer, vectors
-from dln_jax.mechanics.closed_form import ClosedForm, RecursiveSystem
 from dln_jax.mechanics.dynamics import (
     Dynamics,
     Flow,
+    Functions,
     InverseForward,
     PhaseRates,
-    PlainDynamics,
-    PlainFlow,
-    decompose_by_differences,
     friction_of,
-    make_plain_dynamics,
 )
+from dln_jax.mechanics.explicit import ExplicitSystem
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
-from dln_jax.mechanics.joint_friction import LoadedSystem, link_force, loaded_dynamics
+from dln_jax.mechanics.joint_friction import LoadedSystem, carried, carrying, link_force
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalHamiltonian, NaturalSystem
 from dln_jax.types import Hamiltonian, InputError, Vector
 
 Canonical = NaturalHamiltonian | HamiltonianSystem
 """Energies in terms of momenta."""
-Energies = NaturalSystem | ClosedForm | RecursiveSystem | LagrangianSystem | Canonical | LoadedSystem
+Energies = NaturalSystem | ExplicitSystem | LagrangianSystem | Canonical | LoadedSystem
 Driven = Energies | InverseForward
 """Systems with applied forces."""
 System = Driven | PhaseRates
 
 
-def _dynamics_of_loaded(system: LoadedSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    link = dynamics(system.link, degrees_of_freedom=degrees_of_freedom)
-    return loaded_dynamics(system, link, degrees_of_freedom=degrees_of_freedom)
-
-
-def _dynamics_of_functions(system: InverseForward, *, degrees_of_freedom: int | None = None) -> PlainDynamics:
-    # The decomposition takes differences of the inverse function, so friction counts as Coriolis force.
-    decompose = partial(decompose_by_differences, system.inverse_dynamics)
-    return make_plain_dynamics(*system, decompose, degrees_of_freedom=degrees_of_freedom)
-
-
-_DYNAMICS: dict[type, Any] = {
-    NaturalSystem: natural.dynamics,
-    ClosedForm: closed_form.dynamics,
-    RecursiveSystem: closed_form.dynamics,
-    LagrangianSystem: lagrangian.dynamics,
-    NaturalHamiltonian: natural.hamiltonian_dynamics,
-    HamiltonianSystem: hamiltonian.dynamics,
-    LoadedSystem: _dynamics_of_loaded,
-    InverseForward: _dynamics_of_functions,
-}
-
-
 @overload
 def dynamics(system: Energies, *, degrees_of_freedom: int | None = None) -> Dynamics: ...
 @overload
-def dynamics(system: InverseForward, *, degrees_of_freedom: int | None = None) -> PlainDynamics: ...
-def dynamics(system: System, *, degrees_of_freedom: int | None = None) -> Dynamics | PlainDynamics:
+def dynamics(system: InverseForward, *, degrees_of_freedom: int | None = None) -> InverseForward: ...
+def dynamics(system: System, *, degrees_of_freedom: int | None = None) -> Dynamics | InverseForward:
     """Returns the functions of a system in coordinates and velocities.
 
     Args:
@@ -85,18 +58,75 @@ def dynamics(system: System, *, degrees_of_freedom: int | None = None) -> Dynami
     Raises:
         InputError: the system is the rates of a phase space, which do not define forces, or not a record.
     """
-    make = _DYNAMICS.get(type(system))
-    if make is None:
+    d = degrees_of_freedom
+    if not isinstance(system, Driven):
         hint = ": give model.energies(parameters)" if hasattr(system, "energies") else ""
-        raise InputError(f"dynamics got a {type(system).__name__}{hint}; expected one of {_names(*_DYNAMICS)}")
-    return make(system, degrees_of_freedom=degrees_of_freedom)
+        raise InputError(f"dynamics got a {type(system).__name__}{hint}; expected one of {_names(Driven)}")
+    functions = system if isinstance(system, InverseForward) else _functions(system, d)
+    inverse, forward = functions[:2]
+    both = InverseForward(
+        lambda q, qd, qdd: answer(inverse, *vectors(d, q=q, qd=qd, qdd=qdd)),
+        lambda q, qd, tau: answer(forward, *vectors(d, q=q, qd=qd, tau=tau)),
+    )
+    if isinstance(functions, InverseForward):
+        return both
+    energy, mass_matrix, decompose = functions[2:]
+    force = friction_of(system)
+
+    def mass_matrix_or_at_rest(q, qd=None):
+        if qd is None:
+            (q,) = vectors(d, q=q)
+            return answer(mass_matrix, q, jnp.zeros_like(q))
+        return answer(mass_matrix, *vectors(d, q=q, qd=qd))
+
+    def friction(q, qd):
+        q, qd = vectors(d, q=q, qd=qd)
+        return jnp.zeros_like(qd) if force is None else answer(force, q, qd)
+
+    return Dynamics(
+        *both,
+        lambda q, qd: answer(energy, *vectors(d, q=q, qd=qd)),
+        mass_matrix_or_at_rest,
+        lambda q, qd, qdd: answer(decompose, *vectors(d, q=q, qd=qd, qdd=qdd)),
+        friction,
+    )
+
+
+def _functions(system: Energies, d: int | None) -> Functions:
+    """Returns the functions of energies, with friction in forces and accelerations."""
+    match system:
+        case NaturalSystem():
+            functions = natural.functions(system)
+        case ExplicitSystem():
+            functions = explicit.functions(system)
+        case LagrangianSystem():
+            functions = lagrangian.functions(system, d)
+        case NaturalHamiltonian():
+            functions = natural.canonical_functions(system)
+        case HamiltonianSystem():
+            functions = hamiltonian.functions(system)
+        case LoadedSystem(link, load):
+            behind = _functions(link, d)
+            functions = (
+                lambda q, qd, qdd: carrying(load, qd, behind[0](q, qd, qdd)),
+                lambda q, qd, tau: behind[1](q, qd, carried(load, qd, tau)),
+                *behind[2:],
+            )
+    force = friction_of(system)
+    if force is None:
+        return functions
+    return (
+        lambda q, qd, qdd: functions[0](q, qd, qdd) + force(q, qd),
+        lambda q, qd, tau: functions[1](q, qd, tau - force(q, qd)),
+        *functions[2:],
+    )
 
 
 @overload
 def flow(system: Energies, *, degrees_of_freedom: int | None = None) -> Flow: ...
 @overload
-def flow(system: PhaseRates, *, degrees_of_freedom: int | None = None) -> Flow | PlainFlow: ...
-def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | PlainFlow:
+def flow(system: PhaseRates, *, degrees_of_freedom: int | None = None) -> Flow | PhaseRates: ...
+def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | PhaseRates:
     """Returns the functions of a system in (q, p), without applied forces; arguments as for `dynamics`.
 
     Raises:
@@ -105,21 +135,17 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pla
     d = degrees_of_freedom
     if isinstance(system, PhaseRates):
         rates, energy = system
-        checked_rates = PlainFlow(lambda q, p: answer(rates, *vectors(d, q=q, p=p)))
+        checked = PhaseRates(lambda q, p: answer(rates, *vectors(d, q=q, p=p)))
         if energy is None:
-            return checked_rates
-        return Flow(*checked_rates, lambda q, p: answer(energy, *vectors(d, q=q, p=p)))
+            return checked
+        return Flow(checked.rates, lambda q, p: answer(energy, *vectors(d, q=q, p=p)))
     if not isinstance(system, Energies):
-        known = [*_DYNAMICS, PhaseRates]
-        known.remove(InverseForward)
-        raise InputError(f"flow got a {type(system).__name__}; expected one of {_names(*known)}")
+        raise InputError(f"flow got a {type(system).__name__}; expected one of {_names(Energies | PhaseRates)}")
     H = hamiltonian_of(system)
 
     def hamilton(q, p):
-        if isinstance(system, LoadedSystem):
-            qd = hamiltonian.velocity(H, q, p)
-            return hamiltonian.time_derivative(H, q, p, driving_force(system, q, qd, jnp.zeros_like(q)))
-        return hamiltonian.time_derivative(H, q, p, jnp.zeros_like(q), dissipation=system.dissipation)
+        force, qd = jax.grad(H, argnums=(0, 1))(q, p)
+        return qd, driving_force(system, q, qd, jnp.zeros_like(q)) - force
 
     return Flow(lambda q, p: answer(hamilton, *vectors(d, q=q, p=p)), lambda q, p: answer(H, *vectors(d, q=q, p=p)))
 
@@ -139,13 +165,13 @@ def hamiltonian_of(system: Energies) -> Hamiltonian:
             return system.hamiltonian
         case NaturalHamiltonian() | NaturalSystem():
             return natural.hamiltonian(system)
-        case ClosedForm() | RecursiveSystem():
-            return hamiltonian.legendre(closed_form.lagrangian(system), iterations=1)
+        case ExplicitSystem():
+            return hamiltonian.legendre(explicit.lagrangian(system), iterations=1)
         case LagrangianSystem():
             return hamiltonian.legendre(system.lagrangian)
         case LoadedSystem():
             return hamiltonian_of(system.link)
 
 
-def _names(*types: type) -> str:
-    return ", ".join(record.__name__ for record in types)
+def _names(records: Any) -> str:
+    return ", ".join(record.__name__ for record in get_args(records))

@@ -93,14 +93,17 @@ PARAMETERS: Mapping[FrictionLaw, tuple[str, ...]] = {
 
 def coefficients_of(laws: Iterable[FrictionLaw]) -> tuple[str, ...]:
     """Returns the names of the laws' coefficients, in the order of `FrictionCoefficients`."""
-    names = {name for law in laws for name in PARAMETERS[law]}
-    return tuple(name for name in FrictionCoefficients._fields if name in names)
+    return _in_laws(laws, FrictionCoefficients._fields)
 
 
 def shape_of(laws: Iterable[FrictionLaw]) -> tuple[str, ...]:
     """Returns the names of the laws' shape parameters, in the order of `FrictionShape`."""
-    names = {name for law in laws for name in PARAMETERS[law]}
-    return tuple(name for name in FrictionShape._fields if name in names)
+    return _in_laws(laws, FrictionShape._fields)
+
+
+def _in_laws(laws: Iterable[FrictionLaw], names: tuple[str, ...]) -> tuple[str, ...]:
+    used = {name for law in laws for name in PARAMETERS[law]}
+    return tuple(name for name in names if name in used)
 
 
 def require_laws(laws: Any, name: str) -> None:

@@ -20,9 +20,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from dln_jax.mechanics.dynamics import Dynamics, decompose_by_differences, friction_force, make_dynamics
+from dln_jax.mechanics.dynamics import Functions, decompose_by_differences, friction_force
 from dln_jax.solvers.elimination import solve
-from dln_jax.types import Dissipation, Hamiltonian, Scalar, Vector, require_positive
+from dln_jax.types import Dissipation, Hamiltonian, Matrix, Scalar, Vector, require_positive
 
 Energy = Callable[[Array, Array], Array]
 """A Lagrangian or Hamiltonian."""
@@ -59,11 +59,9 @@ def time_derivative(
     return qd, pd if dissipation is None else pd - friction_force(dissipation, q, qd)
 
 
-def inverse(H: Hamiltonian, q: Vector, p: Vector, pd: Vector, *, dissipation: Dissipation | None = None) -> Vector:
-    """Returns the generalised force tau = pd + dH/dq + dD/dqd [d] of a motion."""
-    force, qd = jax.grad(H, argnums=(0, 1))(q, p)
-    tau = pd + force
-    return tau if dissipation is None else tau + friction_force(dissipation, q, qd)
+def inverse(H: Hamiltonian, q: Vector, p: Vector, pd: Vector) -> Vector:
+    """Returns the generalised force tau = pd + dH/dq [d] of a motion, without friction."""
+    return pd + jax.grad(H)(q, p)
 
 
 def conjugate(
@@ -158,15 +156,15 @@ def _require_iterations(iterations: int | None) -> None:
         require_positive(iterations=iterations)
 
 
-def dynamics(system: HamiltonianSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """Returns all functions of the system in coordinates and velocities."""
+def functions(system: HamiltonianSystem) -> Functions:
+    """Returns the functions of the system in coordinates and velocities."""
     H, _, iterations, initial_guess = system
     _require_iterations(iterations)
 
     def momentum(q: Vector, qd: Vector) -> Vector:
         return conjugate(H, q, qd, iterations=iterations, initial_guess=initial_guess)
 
-    def inverse_mass(q: Vector, p: Vector):
+    def inverse_mass(q: Vector, p: Vector) -> Matrix:
         return jax.jacfwd(lambda momentum: velocity(H, q, momentum))(p)
 
     def forces(q: Vector, qd: Vector, qdd: Vector) -> Vector:
@@ -178,12 +176,10 @@ def dynamics(system: HamiltonianSystem, *, degrees_of_freedom: int | None = None
         p = momentum(q, qd)
         return jax.jvp(lambda *state: velocity(H, *state), (q, p), time_derivative(H, q, p, tau))[1]
 
-    return make_dynamics(
-        system,
-        forces,
-        accelerate,
-        functools.partial(decompose_by_differences, forces),
-        lambda q, qd: H(q, momentum(q, qd)),
-        lambda q, qd: solve(inverse_mass(q, momentum(q, qd)), jnp.eye(q.shape[0], dtype=q.dtype)),
-        degrees_of_freedom=degrees_of_freedom,
-    )
+    def energy(q: Vector, qd: Vector) -> Scalar:
+        return H(q, momentum(q, qd))
+
+    def mass_matrix(q: Vector, qd: Vector) -> Matrix:
+        return solve(inverse_mass(q, momentum(q, qd)), jnp.eye(q.shape[0], dtype=q.dtype))
+
+    return forces, accelerate, energy, mass_matrix, functools.partial(decompose_by_differences, forces)

@@ -19,8 +19,8 @@ Source: Hairer, Lubich and Wanner, "Geometric Numerical Integration" (2006), cha
 
 import functools
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -40,56 +40,72 @@ Step = Callable[[Any, Any, Any], Any]
 """(t, state, dt) -> state at t + dt; dt may be traced, and negative."""
 
 
-class Tableau(NamedTuple):
-    """Coefficients of a Runge-Kutta method, which is explicit if `stages` is strictly lower triangular."""
-
-    stages: tuple[tuple[float, ...], ...]
-    """a [s, s]: weights of the stages' rates in the stages."""
-    weights: tuple[float, ...]
-    """b [s]: weights of the stages' rates in the step."""
-
-    @property
-    def nodes(self) -> tuple[float, ...]:
-        """c [s], times of the stages in units of dt: row sums of a."""
-        return tuple(sum(row) for row in self.stages)
+Method = Callable[[Field], Step]
+"""Field -> step, such as `rk4`, or `radau3` for stiff fields."""
 
 
-EULER = Tableau(stages=((0.0,),), weights=(1.0,))
-CLASSICAL = Tableau(
-    stages=((0.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.0, 0.0), (0.0, 0.5, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)),
-    weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
-)
-MIDPOINT = Tableau(stages=((0.5,),), weights=(1.0,))
-_SKEW = math.sqrt(3) / 6
-GAUSS_LEGENDRE_4 = Tableau(stages=((0.25, 0.25 - _SKEW), (0.25 + _SKEW, 0.25)), weights=(0.5, 0.5))
-RADAU_3 = Tableau(stages=((5 / 12, -1 / 12), (0.75, 0.25)), weights=(0.75, 0.25))
-
-
-def runge_kutta(tableau: Tableau, field: Field, *, tolerance: float = 1e-9, iterations: int = 20) -> Step:
-    """Returns a step of y' = f(t, y) by the method of a tableau.
+def runge_kutta(
+    stages: Sequence[Sequence[float]],
+    weights: Sequence[float],
+    field: Field,
+    *,
+    tolerance: float = 1e-9,
+    iterations: int = 20,
+) -> Step:
+    """Returns a step of y' = f(t, y) by the method with coefficients a, b and c_i = sum_j a_ij.
 
         Y_i = y + dt sum_j a_ij f(t + c_j dt, Y_j),    y <- y + dt sum_i b_i f(t + c_i dt, Y_i)
 
-    Newton's method solves for the stages of an implicit method; derivatives use the implicit function theorem. A step
-    whose stages do not converge is NaN: take a smaller dt.
+    The method is explicit if a is strictly lower triangular. Newton's method solves for the stages of an implicit one;
+    derivatives use the implicit function theorem. A step whose stages do not converge is NaN: take a smaller dt.
 
     Args:
+        stages: a [s, s].
+        weights: b [s].
         field: (t, state) -> rate.
         tolerance: largest error of the equations for Y, in the state's units, before the last Newton step, which about
             squares it; implicit methods only.
         iterations: largest number of Newton steps; implicit methods only.
     """
     field = jax.jit(field)  # traced once for all stages
-    if any(entry for i, row in enumerate(tableau.stages) for entry in row[i:]):
-        return functools.partial(_implicit_step, tableau, field, tolerance, iterations)
-    return functools.partial(_explicit_step, tableau, field)
+    nodes = [sum(row) for row in stages]
+
+    def explicit(t, state: State, dt) -> State:
+        rates = []
+        for row, node in zip(stages, nodes, strict=True):
+            rates.append(field(t + node * dt, _combine(state, dt, row, rates)))
+        return _combine(state, dt, weights, rates)
+
+    def implicit(t, state: State, dt) -> State:
+        start, unravel = ravel_pytree(state)
+        a, b, c = (jnp.asarray(entry, start.dtype) for entry in (stages, weights, nodes))
+
+        def rates(values, t, dt):
+            return jax.vmap(lambda t, value: ravel_pytree(field(t, unravel(value)))[0])(t + c * dt, values)
+
+        # The unknowns are the states of the stages, whose size sets the scale of rounding even where all rates vanish.
+        def equations(values, start, t, dt):
+            values = values.reshape(len(b), -1)
+            return (values - start - dt * a @ rates(values, t, dt)).ravel()
+
+        first = jnp.tile(start, len(b))
+        values, info = find_root(equations, first, start, t, dt, tolerance=tolerance, iterations=iterations)
+        end = start + dt * b @ rates(values.reshape(len(b), -1), t, dt)
+        return unravel(jnp.where(info.converged, end, jnp.nan))
+
+    return implicit if any(entry for i, row in enumerate(stages) for entry in row[i:]) else explicit
 
 
-explicit_euler = functools.partial(runge_kutta, EULER)
-rk4 = functools.partial(runge_kutta, CLASSICAL)
-implicit_midpoint = functools.partial(runge_kutta, MIDPOINT)
-gauss_legendre4 = functools.partial(runge_kutta, GAUSS_LEGENDRE_4)
-radau3 = functools.partial(runge_kutta, RADAU_3)
+explicit_euler = functools.partial(runge_kutta, [[0.0]], [1.0])
+rk4 = functools.partial(
+    runge_kutta,
+    [[0.0, 0.0, 0.0, 0.0], [0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]],
+    [1 / 6, 1 / 3, 1 / 3, 1 / 6],
+)
+implicit_midpoint = functools.partial(runge_kutta, [[0.5]], [1.0])
+_SKEW = math.sqrt(3) / 6
+gauss_legendre4 = functools.partial(runge_kutta, [[0.25, 0.25 - _SKEW], [0.25 + _SKEW, 0.25]], [0.5, 0.5])
+radau3 = functools.partial(runge_kutta, [[5 / 12, -1 / 12], [0.75, 0.25]], [0.75, 0.25])
 
 
 def looped_rk4(field: Field) -> Step:
@@ -184,10 +200,14 @@ def rollout(step: Step, state: State, t: Float[Array | np.ndarray, " T"], *, sub
     times = jnp.asarray(t, jnp.result_type(*jax.tree.leaves(state)))
 
     def interval(state, start_and_duration):
-        start, duration = start_and_duration
-        return advance(step, start, state, duration, substeps=substeps), None
+        return advance(step, start_and_duration[0], state, start_and_duration[1], substeps=substeps)
 
-    _, later = steps_in_turn(interval, state, (times[:-1], jnp.diff(times)))
+    return from_start(interval, state, (times[:-1], jnp.diff(times)))
+
+
+def from_start(step: Callable[[State, Any], State], state: State, inputs: Any) -> State:
+    """Returns a state and those after each step (state, input) -> state; leaves get a leading axis."""
+    _, later = steps_in_turn(lambda state, input: (step(state, input), None), state, inputs)
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state, later)
 
 
@@ -225,34 +245,9 @@ def _plus(state: State, dt, rate: State) -> State:
     return jax.tree.map(lambda value, slope: value + dt * slope, state, rate)
 
 
-def _combine(state: State, dt, weights: tuple[float, ...], rates: list[State]) -> State:
+def _combine(state: State, dt, weights: Sequence[float], rates: list[State]) -> State:
     used = [(weight, rate) for weight, rate in zip(weights, rates, strict=False) if weight]
     if not used:
         return state
     scaled = [jax.tree.map(lambda slope, weight=weight: weight * slope, rate) for weight, rate in used]
     return _plus(state, dt, jax.tree.map(lambda *slopes: sum(slopes), *scaled))
-
-
-def _explicit_step(tableau: Tableau, field: Field, t, state: State, dt) -> State:
-    rates = []
-    for row, node in zip(tableau.stages, tableau.nodes, strict=True):
-        rates.append(field(t + node * dt, _combine(state, dt, row, rates)))
-    return _combine(state, dt, tableau.weights, rates)
-
-
-def _implicit_step(tableau: Tableau, field: Field, tolerance: float, iterations: int, t, state: State, dt) -> State:
-    start, unravel = ravel_pytree(state)
-    stages, weights, nodes = (jnp.asarray(entry, start.dtype) for entry in (*tableau, tableau.nodes))
-
-    def rates(values, t, dt):
-        return jax.vmap(lambda t, value: ravel_pytree(field(t, unravel(value)))[0])(t + nodes * dt, values)
-
-    # The unknowns are the states of the stages, whose size sets the scale of rounding even where all rates vanish.
-    def equations(values, start, t, dt):
-        values = values.reshape(len(weights), -1)
-        return (values - start - dt * stages @ rates(values, t, dt)).ravel()
-
-    first = jnp.tile(start, len(weights))
-    values, info = find_root(equations, first, start, t, dt, tolerance=tolerance, iterations=iterations)
-    end = start + dt * weights @ rates(values.reshape(len(weights), -1), t, dt)
-    return unravel(jnp.where(info.converged, end, jnp.nan))

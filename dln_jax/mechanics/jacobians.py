@@ -21,16 +21,16 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from dln_jax.mechanics.closed_form import ClosedForm, RecursiveSystem
-from dln_jax.mechanics.dynamics import InverseForward, friction_force
+from dln_jax.mechanics.dynamics import InverseForward, friction_of
 from dln_jax.mechanics.equations import Driven, Energies, dynamics
+from dln_jax.mechanics.explicit import ExplicitSystem
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.joint_friction import LoadedSystem
 from dln_jax.mechanics.natural import NaturalHamiltonian, NaturalSystem
 from dln_jax.solvers.elimination import solve, solve_lower
 from dln_jax.types import Matrix, Vector
 
-Natural = NaturalSystem | ClosedForm | RecursiveSystem | NaturalHamiltonian
+Natural = NaturalSystem | ExplicitSystem | NaturalHamiltonian
 """Energies with a mass matrix that depends on q alone."""
 Jacobians = tuple[Array, Array, Array]
 """Derivatives [d, d] by three arguments; row i belongs to result i."""
@@ -42,9 +42,8 @@ def inverse_dynamics_jacobians(system: Driven, q: Vector, qd: Vector, qdd: Vecto
     if not isinstance(system, Natural):
         return jax.jacrev(motion.inverse_dynamics, argnums=(0, 1, 2))(q, qd, qdd)
     tau_q, tau_qd, mass = _natural_jacobians(system, lambda q: motion.inverse_dynamics(q, qd, qdd), q, qd)
-    if system.dissipation is not None:
-        D = system.dissipation
-        tau_qd += jax.jacfwd(lambda velocity: friction_force(D, q, velocity))(qd)
+    if (friction := friction_of(system)) is not None:
+        tau_qd += jax.jacfwd(friction, argnums=1)(q, qd)
     return tau_q, tau_qd, mass
 
 

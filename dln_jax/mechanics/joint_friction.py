@@ -20,9 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.mechanics.dynamics import Dynamics, InverseForward, PhaseRates, friction_force, make_dynamics
+from dln_jax.mechanics.dynamics import InverseForward, PhaseRates, friction_force
 from dln_jax.mechanics.friction import joint_rates
-from dln_jax.types import Dissipation, Potential, Scalar, Vector
+from dln_jax.types import Dissipation, Potential, Vector
 
 
 class Load(NamedTuple):
@@ -75,15 +75,9 @@ def with_friction(system: Any, dissipation: Dissipation | None, load: Load | Non
     return LoadedSystem(_dissipating(system, None), load, system.dissipation)
 
 
-def sum_of(first: Dissipation | None, second: Dissipation) -> Dissipation:
-    """Returns the sum of two Rayleigh functions."""
-    if first is None:
-        return second
-
-    def both(q: Vector, qd: Vector) -> Scalar:
-        return first(q, qd) + second(q, qd)
-
-    return both
+def sum_of(first: Callable[..., Array] | None, second: Callable[..., Array]) -> Callable[..., Array]:
+    """Returns the sum of two functions of a state; an absent one is never traced."""
+    return second if first is None else lambda *state: first(*state) + second(*state)
 
 
 def carrying(load: Load, qd: Vector, tau_link: Vector) -> Vector:
@@ -111,19 +105,6 @@ def link_force(system: LoadedSystem, q: Vector, qd: Vector, tau: Vector) -> Vect
     if system.dissipation is not None:
         tau = tau - friction_force(system.dissipation, q, qd)
     return carried(system.load, qd, tau)
-
-
-def loaded_dynamics(system: LoadedSystem, link: Dynamics, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """Returns all functions; `friction` is that of the dissipation alone, and `decompose` that of the links."""
-    return make_dynamics(
-        system,
-        lambda q, qd, qdd: carrying(system.load, qd, link.inverse_dynamics(q, qd, qdd)),
-        lambda q, qd, tau: link.forward_dynamics(q, qd, carried(system.load, qd, tau)),
-        link.decompose,
-        link.energy,
-        link.mass_matrix,
-        degrees_of_freedom=degrees_of_freedom,
-    )
 
 
 def _dissipating(system: Any, dissipation: Dissipation | None) -> Any:

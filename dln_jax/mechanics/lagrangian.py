@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from dln_jax.mechanics.arguments import require_size_of
-from dln_jax.mechanics.dynamics import Dynamics, decompose_by_differences, make_dynamics
+from dln_jax.mechanics.dynamics import Functions, decompose_by_differences
 from dln_jax.solvers.elimination import solve
 from dln_jax.types import Dissipation, Lagrangian, Matrix, Scalar, Vector
 
@@ -56,12 +56,12 @@ def forward_dynamics(L: Lagrangian, q: Vector, qd: Vector, tau: Vector) -> Vecto
     return solve(mass_matrix(L, q, qd), tau - bias)
 
 
-def dynamics(system: LagrangianSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """Returns all functions of the system; with `degrees_of_freedom` they refuse states of another size.
+def functions(system: LagrangianSystem, degrees_of_freedom: int | None) -> Functions:
+    """Returns the functions of the system.
 
-    Without it, they refuse states that lack entries which L reads, or have rates that L ignores.
+    Without `degrees_of_freedom`, they refuse states that lack entries which L reads, or have rates that L ignores.
     """
-    accepted = set() if degrees_of_freedom is None else {degrees_of_freedom}
+    accepted = {degrees_of_freedom}
 
     def L(q: Vector, qd: Vector) -> Scalar:
         size = q.shape[0]
@@ -71,12 +71,6 @@ def dynamics(system: LagrangianSystem, *, degrees_of_freedom: int | None = None)
             accepted.add(size)
         return system.lagrangian(q, qd)
 
-    return make_dynamics(
-        system,
-        partial(inverse_dynamics, L),
-        partial(forward_dynamics, L),
-        partial(decompose_by_differences, partial(inverse_dynamics, L)),
-        partial(energy, L),
-        partial(mass_matrix, L),
-        degrees_of_freedom=degrees_of_freedom,
-    )
+    force = partial(inverse_dynamics, L)
+    decompose = partial(decompose_by_differences, force)
+    return force, partial(forward_dynamics, L), partial(energy, L), partial(mass_matrix, L), decompose

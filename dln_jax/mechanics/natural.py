@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics, make_dynamics, minus_potential, plus_potential
+from dln_jax.mechanics.dynamics import Decomposition, Functions, minus_potential, plus_potential
 from dln_jax.solvers.elimination import solve_lower, solve_lower_transposed
 from dln_jax.types import CholeskyFactor, Dissipation, Hamiltonian, Lagrangian, Matrix, Potential, Scalar, Vector
 
@@ -78,8 +78,8 @@ def forces(system: NaturalSystem, q: Vector, qd: Vector, qdd: Vector) -> Vector:
     return tau if system.potential is None else tau + jax.grad(system.potential)(q)
 
 
-def dynamics(system: NaturalSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """Returns all functions of the system; two triangular solves with the factor give the forward model."""
+def functions(system: NaturalSystem) -> Functions:
+    """Returns the functions of the system; two triangular solves with the factor give the forward model."""
 
     def accelerate(q: Vector, qd: Vector, tau: Vector) -> Vector:
         bias, factor = forces(system, q, qd, jnp.zeros_like(qd)), system.cholesky(q)
@@ -92,19 +92,14 @@ def dynamics(system: NaturalSystem, *, degrees_of_freedom: int | None = None) ->
             gravity=_gravity(system.potential, q),
         )
 
-    return make_dynamics(
-        system,
-        partial(forces, system),
-        accelerate,
-        decompose,
-        lambda q, qd: plus_potential(_half_square(system.cholesky(q).T @ qd), system.potential, q),
-        lambda q, qd: mass_matrix(system, q),
-        degrees_of_freedom=degrees_of_freedom,
-    )
+    def energy(q: Vector, qd: Vector) -> Scalar:
+        return plus_potential(_half_square(system.cholesky(q).T @ qd), system.potential, q)
+
+    return partial(forces, system), accelerate, energy, lambda q, qd: mass_matrix(system, q), decompose
 
 
-def hamiltonian_dynamics(system: NaturalHamiltonian, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """Returns all functions of the system in coordinates and velocities.
+def canonical_functions(system: NaturalHamiltonian) -> Functions:
+    """Returns the functions of the system in coordinates and velocities.
 
     With y = L⁻¹ qd, p = L⁻ᵀ y: qdd = dL/dt y + L (dL/dtᵀ p + Lᵀ dp/dt), and dT/dq_k = pᵀ dL/dq_k y.
     """
@@ -138,15 +133,13 @@ def hamiltonian_dynamics(system: NaturalHamiltonian, *, degrees_of_freedom: int 
         force = kinetic_force(q, qd, qdd)
         return force if system.potential is None else force + jax.grad(system.potential)(q)
 
-    return make_dynamics(
-        system,
-        tau,
-        accelerate,
-        decompose,
-        lambda q, qd: plus_potential(_half_square(solve_lower(system.inverse_factor(q), qd)), system.potential, q),
-        lambda q, qd: jax.vmap(partial(mass_times, q))(jnp.eye(q.shape[0], dtype=q.dtype)),
-        degrees_of_freedom=degrees_of_freedom,
-    )
+    def energy(q: Vector, qd: Vector) -> Scalar:
+        return plus_potential(_half_square(solve_lower(system.inverse_factor(q), qd)), system.potential, q)
+
+    def mass_matrix(q: Vector, qd: Vector) -> Matrix:
+        return jax.vmap(partial(mass_times, q))(jnp.eye(q.shape[0], dtype=q.dtype))
+
+    return tau, accelerate, energy, mass_matrix, decompose
 
 
 def _half_square(vector: Vector) -> Scalar:

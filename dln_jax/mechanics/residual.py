@@ -6,18 +6,16 @@ A potential explains forces that repeat with the position (springs, cables, gear
 also depend on the velocity, and a kinetic energy, which can only add inertia, flexible parts.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import Array
 
-from dln_jax.mechanics import closed_form, natural
-from dln_jax.mechanics.closed_form import ClosedForm, RecursiveSystem
-from dln_jax.mechanics.dynamics import friction_of, minus_potential
-from dln_jax.mechanics.joint_friction import LoadedSystem, with_friction
+from dln_jax.mechanics import natural
+from dln_jax.mechanics.dynamics import minus_potential
+from dln_jax.mechanics.explicit import ExplicitSystem
+from dln_jax.mechanics.joint_friction import LoadedSystem, sum_of, with_friction
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.types import CholeskyFactor, Dissipation, Potential, Scalar, Vector
@@ -34,7 +32,7 @@ class Residual(NamedTuple):
     """q -> lower triangular L [d, d]."""
 
 
-def with_residual(system: Any, residual: Residual) -> RecursiveSystem | LagrangianSystem | LoadedSystem:
+def with_residual(system: Any, residual: Residual) -> ExplicitSystem | LagrangianSystem | LoadedSystem:
     """Adds energies to those of a system.
 
     In a `LoadedSystem`, potential and inertia are added behind the transmission, and dissipation before it.
@@ -53,27 +51,17 @@ def with_residual(system: Any, residual: Residual) -> RecursiveSystem | Lagrangi
             return L if factor is None else L + 0.5 * jnp.sum((factor(q).T @ qd) ** 2)
 
         return with_friction(system._replace(lagrangian=lagrangian), D)
-    system = _recursive(system)
+    if isinstance(system, NaturalSystem):
+        parts = partial(natural.mass_matrix, system), partial(natural.forces, system)
+        system = ExplicitSystem(*parts, system.potential, system.dissipation)
+    system = system._replace(decompose=None)
     if V is not None:
-        forces = _sum(system.forces, lambda q, qd, qdd: jax.grad(V)(q))
-        system = system._replace(forces=forces, potential=V if system.potential is None else _sum(V, system.potential))
+        forces = sum_of(system.forces, lambda q, qd, qdd: jax.grad(V)(q))
+        system = system._replace(forces=forces, potential=sum_of(system.potential, V))
     if factor is not None:
         moving = NaturalSystem(factor)
         system = system._replace(
-            mass_matrix=_sum(system.mass_matrix, partial(natural.mass_matrix, moving)),
-            forces=_sum(system.forces, partial(natural.forces, moving)),
+            mass_matrix=sum_of(system.mass_matrix, partial(natural.mass_matrix, moving)),
+            forces=sum_of(system.forces, partial(natural.forces, moving)),
         )
     return with_friction(system, D)
-
-
-def _recursive(system: RecursiveSystem | ClosedForm | NaturalSystem) -> RecursiveSystem:
-    if isinstance(system, RecursiveSystem):
-        return system
-    V, D, friction = system.potential, system.dissipation, friction_of(system)
-    if isinstance(system, ClosedForm):
-        return RecursiveSystem(system.mass_matrix, partial(closed_form.forces, system), V, D, friction)
-    return RecursiveSystem(partial(natural.mass_matrix, system), partial(natural.forces, system), V, D, friction)
-
-
-def _sum(first: Callable[..., Array], second: Callable[..., Array]) -> Callable[..., Array]:
-    return lambda *state: jnp.add(first(*state), second(*state))

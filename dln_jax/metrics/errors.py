@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics import hamiltonian
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.mechanics.equations import Canonical, Driven, dynamics, hamiltonian_of
 from dln_jax.scale import spread
 from dln_jax.types import Hamiltonian, InputError
@@ -144,7 +144,7 @@ class Definiteness(NamedTuple):
 
 
 def definiteness(
-    dynamics: Dynamics | PlainDynamics, q: Float[Array | np.ndarray, "N d"], qd: Float[Array | np.ndarray, "N d"]
+    dynamics: Dynamics | InverseForward, q: Float[Array | np.ndarray, "N d"], qd: Float[Array | np.ndarray, "N d"]
 ) -> Definiteness:
     """Evaluates the eigenvalues of the mass matrix at N states. It only reports; nothing is repaired.
 

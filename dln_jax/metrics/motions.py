@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.discrete import Torque, driven, torque_slopes
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.mechanics.integrators import looped_rk4
 from dln_jax.metrics.phase_space import finite_or_infinite
 from dln_jax.types import InputError, Vector, require_positive
@@ -45,7 +45,7 @@ class Motion(NamedTuple):
 
 
 def follow(
-    dynamics: Dynamics | PlainDynamics,
+    dynamics: Dynamics | InverseForward,
     q0: Vector,
     qd0: Vector,
     tau: Float[Array, "T d"],
@@ -74,7 +74,7 @@ def follow(
 
 
 def motion_program(
-    dynamics_of: Callable[[Any], Dynamics | PlainDynamics],
+    dynamics_of: Callable[[Any], Dynamics | InverseForward],
 ) -> Callable[[Any, tuple[Array, ...]], tuple[Motion, Array | None]]:
     """Returns (parameters, records) -> motions and their energies, for `jax.jit`; leading axes [TORQUES, trajectories].
 

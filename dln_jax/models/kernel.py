@@ -42,8 +42,8 @@ from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from dln_jax.mechanics import lagrangian
-from dln_jax.mechanics.closed_form import RecursiveSystem
 from dln_jax.mechanics.dynamics import minus_potential
+from dln_jax.mechanics.explicit import ExplicitSystem
 from dln_jax.models.model import Model
 from dln_jax.types import InputError, JointKind, Needs, Scalar, Vector
 
@@ -142,7 +142,7 @@ def lift_factor(joint: JointKind, pair: Array, x: Array, y: Array) -> Factor:
     return c**2, 2 * c * by_x, 2 * c * by_y, 2 * (by_x * by_y + c * by_both)
 
 
-def _system(parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool) -> RecursiveSystem:
+def _system(parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool) -> ExplicitSystem:
     inertia, friction = parameters.scales.inertia, parameters.friction
 
     def kinetic(q: Vector, qd: Vector) -> Scalar:
@@ -165,7 +165,7 @@ def _system(parameters: KernelParameters, joints: tuple[JointKind, ...], serial:
         return 2 * (M + M.T)
 
     potential = _potential(parameters, joints, serial)
-    return RecursiveSystem(
+    return ExplicitSystem(
         mass_matrix=mass_matrix,
         # By derivatives of T instead of M, which would take d times as long.
         forces=functools.partial(

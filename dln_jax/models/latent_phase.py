@@ -29,7 +29,7 @@ from jaxtyping import Float
 
 from dln_jax.errors import require_network
 from dln_jax.mechanics.arguments import vectors
-from dln_jax.mechanics.dynamics import Flow, PhaseRates, PlainFlow
+from dln_jax.mechanics.dynamics import Flow, PhaseRates
 from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.models.baselines import make_phase_network
@@ -56,7 +56,7 @@ class LatentPhase(NamedTuple):
     """Two frames [2 n] -> (z_q, z_p), both [1]."""
     decode: Callable[[Array, Array], Array]
     """(z_q, z_p) -> two frames [2 n]."""
-    field: Flow | PlainFlow
+    field: Flow | PhaseRates
     """(z_q, z_p) -> rates per frame; with an energy for black-box-hnn."""
 
 

@@ -33,7 +33,7 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float
 
-from dln_jax.mechanics.closed_form import RecursiveSystem
+from dln_jax.mechanics.explicit import ExplicitSystem
 from dln_jax.mechanics.friction import (
     USUAL,
     FrictionCoefficients,
@@ -45,6 +45,7 @@ from dln_jax.mechanics.friction import (
 )
 from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.mechanics.trees.description import Tree
+from dln_jax.mechanics.trees.frames import hat
 from dln_jax.mechanics.trees.motors import Pair, armature_matrix, motors_of, require_motors
 from dln_jax.mechanics.trees.recursions import tree_system
 from dln_jax.models.model import Model
@@ -227,7 +228,7 @@ def make_serial_tree(
         inertias, armature = jnp.tile(body, (d, 1)), jnp.full(d, 0.01, dtype)
         return SerialTreeParameters(turns, 0.15 * positions, inertias, armature, none, none, none)
 
-    def energies(parameters: SerialTreeParameters) -> RecursiveSystem:
+    def energies(parameters: SerialTreeParameters) -> ExplicitSystem:
         coefficients = parameters.viscous, parameters.coulomb, parameters.offset
         dissipation = joint_dissipation(*coefficients, velocity_scale=velocity_scale)
         return tree_system(tree_of(parameters, needs, parents=parents, acceleration=acceleration), dissipation)
@@ -258,12 +259,10 @@ def tree_of(
 
 def rotation(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Returns the rotation matrix exp of a rotation vector, by Rodrigues' formula, smooth at zero."""
-    x, y, z = turn
-    zero = jnp.zeros_like(x)
-    hat = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
+    K = hat(turn)
     square = turn @ turn
     small = square < 1e-8
     angle = jnp.sqrt(jnp.where(small, 1.0, square))
     first = jnp.where(small, 1 - square / 6, jnp.sin(angle) / angle)
     second = jnp.where(small, 0.5 - square / 24, (1 - jnp.cos(angle)) / angle**2)
-    return jnp.eye(3, dtype=turn.dtype) + first * hat + second * hat @ hat
+    return jnp.eye(3, dtype=turn.dtype) + first * K + second * K @ K

@@ -43,7 +43,7 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float
 
-from dln_jax.mechanics.closed_form import ClosedForm
+from dln_jax.mechanics.explicit import ExplicitSystem, closed_form
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.models.model import Model
 from dln_jax.types import InputError, JointKind, Matrix, Needs, Scalar, Vector, require_positive
@@ -116,7 +116,7 @@ def make_trigonometric(
             friction=jnp.zeros(d, dtype) if needs.friction else None,
         )
 
-    def energies(parameters: TrigonometricParameters) -> ClosedForm:
+    def energies(parameters: TrigonometricParameters) -> ExplicitSystem:
         coefficients, potential, friction = parameters.mass[entry], parameters.potential, parameters.friction
 
         def coriolis(q: Vector, qd: Vector) -> Vector:
@@ -124,7 +124,7 @@ def make_trigonometric(
             kinetic = 0.5 * jnp.einsum("i,ijl,j->l", qd, coefficients, qd)
             return (coefficients @ (qd @ slopes)) @ qd - slopes @ kinetic
 
-        return ClosedForm(
+        return closed_form(
             mass_matrix=lambda q: coefficients @ mass_basis(q)[0],
             coriolis=coriolis,
             potential=None if potential is None else lambda q: potential_basis(q)[0][1:] @ potential,
@@ -247,7 +247,7 @@ def make_planar_chain(
             coulomb=zeros(d, needs.friction),
         )
 
-    def energies(parameters: PlanarChainParameters) -> ClosedForm:
+    def energies(parameters: PlanarChainParameters) -> ExplicitSystem:
         moments, skew, motors, weight, sideways, viscous, coulomb = parameters
         zero = jnp.zeros((d, d), moments.dtype)
         lower = zero.at[triangle].set(moments)
@@ -272,7 +272,7 @@ def make_planar_chain(
 
         dissipation = joint_dissipation(viscous, coulomb, velocity_scale=velocity_scale, joint_map=relative)
         held = (None, None) if weight is None else (potential, jax.grad(potential))
-        return ClosedForm(mass_matrix, coriolis, *held, dissipation)
+        return closed_form(mass_matrix, coriolis, *held, dissipation)
 
     return Model(init, energies)
 

@@ -6,8 +6,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from dln_jax.mechanics import closed_form
-from dln_jax.mechanics.closed_form import ClosedForm
+from dln_jax.mechanics import explicit
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.explicit import ExplicitSystem
 from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape, joint_dissipation
 from dln_jax.mechanics.joint_friction import sum_of
 from dln_jax.mechanics.lagrangian import LagrangianSystem
@@ -40,14 +41,14 @@ class Scene(NamedTuple):
     """q -> position [2] of the last body in m, for figures; y points up."""
 
     @property
-    def closed_form(self) -> ClosedForm:
-        """The energies and hand-written forces, for the functions of `mechanics.closed_form`."""
-        return ClosedForm(self.mass_matrix, self.coriolis, self.potential, self.gravity, self.dissipation)
+    def closed_form(self) -> ExplicitSystem:
+        """The energies and hand-written forces, for the functions of `mechanics.explicit`."""
+        return explicit.closed_form(self.mass_matrix, self.coriolis, self.potential, self.gravity, self.dissipation)
 
     @property
     def lagrangian(self) -> Lagrangian:
         """The textbook L(q, qd) = ½ qdᵀ M(q) qd - V(q)."""
-        return closed_form.lagrangian(self.closed_form)
+        return explicit.lagrangian(self.closed_form)
 
     @property
     def energies(self) -> LagrangianSystem:
@@ -80,7 +81,7 @@ def textbook(
 
 def closed_form_forward_dynamics(scene: Scene, q: Vector, qd: Vector, tau: Vector) -> Vector:
     """Returns the acceleration qdd [d] by textbook formulas and LAPACK; the last digits of datasets depend on them."""
-    bias = closed_form.inverse_dynamics(scene.closed_form, q, qd, jnp.zeros_like(qd))
+    bias = dynamics(scene.closed_form).inverse_dynamics(q, qd, jnp.zeros_like(qd))
     return jnp.linalg.solve(scene.mass_matrix(q), tau - bias)
 
 

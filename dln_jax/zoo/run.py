@@ -13,7 +13,7 @@ from jax import Array
 
 from dln_jax.files import is_file
 from dln_jax.mechanics import equations
-from dln_jax.mechanics.dynamics import Dynamics, Flow, InverseForward, PhaseRates, PlainDynamics, PlainFlow
+from dln_jax.mechanics.dynamics import Dynamics, Flow, InverseForward, PhaseRates
 from dln_jax.models import uncertainty as uncertainties
 from dln_jax.models.baselines import Derivatives, FunctionModel
 from dln_jax.models.latent_phase import ImageModel, LatentPhase
@@ -37,7 +37,7 @@ from dln_jax.zoo.parameter_files import (
 if TYPE_CHECKING:
     from dln_jax.zoo.value_functions import ValueRun
 
-Functions = TypeVar("Functions", bound=Dynamics | PlainDynamics | Flow | PlainFlow)
+Functions = TypeVar("Functions", bound=Dynamics | InverseForward | Flow | PhaseRates)
 AnyModel = Model | FunctionModel | ImageModel
 
 
@@ -75,12 +75,12 @@ class Run:
         return self._of("energies", Model).energies(self.parameters)
 
     @functools.cached_property
-    def dynamics(self) -> Dynamics | PlainDynamics:
+    def dynamics(self) -> Dynamics | InverseForward:
         """Functions of coordinates and velocities. Raises InputError for a model that has none."""
         return self._compiled("dynamics", equations.dynamics, PhaseRates)
 
     @functools.cached_property
-    def flow(self) -> Flow | PlainFlow:
+    def flow(self) -> Flow | PhaseRates:
         """Functions of coordinates and momenta, without applied forces. Raises InputError for a model that has none."""
         return self._compiled("flow", equations.flow, InverseForward)
 
@@ -237,7 +237,7 @@ def read_description(directory: Path) -> Description:
 
 def compiled(functions: Functions, dtype: Any) -> Functions:
     """Jits the functions and converts numbers in their arguments to one dtype."""
-    return type(functions)(*(_jitted(function, dtype) for function in functions))
+    return jax.tree.map(lambda function: _jitted(function, dtype), functions)
 
 
 def _jitted(function: Callable[..., Any], dtype: Any) -> Any:

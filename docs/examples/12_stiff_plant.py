@@ -17,7 +17,7 @@ from dln_jax.control.shooting import shoot
 from dln_jax.control.state_space import field_of, integrated, linearise
 from dln_jax.control.trajectories import TrajectoryProblem
 from dln_jax.figures import style
-from dln_jax.mechanics.integrators import CLASSICAL, RADAU_3
+from dln_jax.mechanics.integrators import radau3
 from dln_jax.scenes.pendulums import flexible_cart_pole
 
 jax.config.update("jax_enable_x64", True)
@@ -53,7 +53,7 @@ def off(x):
 
 
 problem = TrajectoryProblem(
-    step=integrated(field, DT, method=RADAU_3),
+    step=integrated(field, DT, method=radau3),
     cost=lambda x, u: DT * (off(x) + 1e-3 * u @ u),
     final_cost=lambda x: 50 * off(x),
     lower=-LIMIT,
@@ -71,8 +71,8 @@ assert solution.converged
 # We simulate the plant with 2000 classical steps per second, and with the plan's own feedback u + K (x - plan) at its
 # samples, within the limits. Classical steps as long as the plan's diverge.
 
-many = jax.jit(integrated(field, DT, method=CLASSICAL, substeps=int(2000 * DT)))
-few = jax.jit(integrated(field, DT, method=CLASSICAL))
+many = jax.jit(integrated(field, DT, substeps=int(2000 * DT)))
+few = jax.jit(integrated(field, DT))
 true, forces, diverged = [start], [], start
 for x, u, K in zip(plan.x, plan.u, plan.K, strict=False):
     forces.append(np.clip(u + K @ (true[-1] - x), -LIMIT, LIMIT))

@@ -12,7 +12,7 @@ from dln_jax import HamiltonianSystem, flow, load
 from dln_jax.commands import train_hnn_pixels
 from dln_jax.commands.pixels import fit, frames
 from dln_jax.commands.pixels.frames import FRAME_TIME, PIXELS, SIDE, energy, render, rod, swinging_rod
-from dln_jax.mechanics.dynamics import PlainFlow
+from dln_jax.mechanics.dynamics import PhaseRates
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.models.latent_phase import LatentPhase, make_image_model
@@ -218,7 +218,7 @@ def test_a_run_is_judged_resumes_and_loads(tmp_path, monkeypatch, capsys):
     system = load(run).images
     pair = films[2].pairs[0, 0]
     q, p = system.encode(pair)
-    assert system.decode(q, p).shape == pair.shape and isinstance(system.field, PlainFlow)
+    assert system.decode(q, p).shape == pair.shape and isinstance(system.field, PhaseRates)
     assert np.isfinite(system.field.rates(q, p)).all()
 
 

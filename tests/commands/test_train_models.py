@@ -11,7 +11,7 @@ from dln_jax.commands import train_delan, train_hnn
 from dln_jax.data import schema
 from dln_jax.learning.engine.optimisers import suited
 from dln_jax.learning.fits import network
-from dln_jax.mechanics.dynamics import PlainDynamics
+from dln_jax.mechanics.dynamics import InverseForward
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import pendulum
 
@@ -79,7 +79,7 @@ def test_black_box_models_report_their_mass_matrix(workplace, capsys):
     metrics = metrics_of(workplace / "black-box")
     assert 0 <= metrics["share_not_definite"] <= 1 and "smallest_mass_eigenvalue" in metrics
     command(train_delan, *brief, "feed-forward", "--out feed-forward")
-    assert isinstance(load(workplace / "feed-forward").dynamics, PlainDynamics)
+    assert isinstance(load(workplace / "feed-forward").dynamics, InverseForward)
 
 
 def test_hamiltonians_are_fitted_to_momenta_or_torques(workplace, capsys):

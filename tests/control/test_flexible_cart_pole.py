@@ -5,7 +5,6 @@ import numpy as np
 from numpy.testing import assert_allclose
 
 from dln_jax.control.state_space import field_of, linearise
-from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.pendulums import flexible_cart_pole
 
@@ -16,7 +15,7 @@ FIELD = jax.jit(field_of(dynamics(SCENE.energies), B))
 
 def test_forces_by_hand_are_those_of_the_energies():
     q, qd, qdd = jax.random.normal(jax.random.key(0), (3, 3))
-    by_hand = closed_form.inverse_dynamics(SCENE.closed_form, q, qd, qdd)
+    by_hand = dynamics(SCENE.closed_form).inverse_dynamics(q, qd, qdd)
     inverse = jax.jit(dynamics(SCENE.energies).inverse_dynamics)
     assert_allclose(inverse(q, qd, qdd), by_hand, rtol=1e-11)
 

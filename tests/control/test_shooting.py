@@ -15,7 +15,7 @@ from dln_jax.control.shooting import optimise, shoot
 from dln_jax.control.state_space import field_of, integrated
 from dln_jax.control.trajectories import TrajectoryProblem, first_plan
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.integrators import GAUSS_LEGENDRE_4, MIDPOINT, RADAU_3
+from dln_jax.mechanics.integrators import gauss_legendre4, implicit_midpoint, radau3
 from dln_jax.scenes.pendulums import cart_pole, flexible_cart_pole
 from dln_jax.solvers.ending import reason
 
@@ -102,7 +102,7 @@ def test_swing_up_of_a_cart_pole_converges_quadratically_and_its_gains_are_deriv
 def test_implicit_steps_have_the_derivatives_of_finite_differences():
     scene = flexible_cart_pole(stiffness=2e5)  # an example of the documentation plans through it
     field = field_of(dynamics(scene.closed_form), np.asarray(scene.needs.actuation))
-    stiff = integrated(field, 0.02, method=MIDPOINT)
+    stiff = integrated(field, 0.02, method=implicit_midpoint)
     step = jax.jit(stiff)
     x = 0.01 * jnp.arange(1.0, 7.0).at[1].set(1e-4)
     u = jnp.array([2.0])
@@ -117,7 +117,7 @@ def test_radau_is_of_order_three_and_forgets_what_decays_fast():
     field = lambda x, u: -u * x  # noqa: E731
     one = jnp.ones(1)
     ends = []
-    for method, order in ((RADAU_3, 3), (GAUSS_LEGENDRE_4, 4)):
+    for method, order in ((radau3, 3), (gauss_legendre4, 4)):
         steps = [integrated(field, 1.0, method=method, substeps=n) for n in (4, 8)]
         errors = [abs(step(one, one)[0] - np.exp(-1)) for step in steps]
         assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.2)

@@ -9,7 +9,7 @@ from calls import one_line
 from dln_jax.control.energy_shaping import EnergyGains, energy_shaping, partial_linearisation, parts_of, passive_energy
 from dln_jax.control.regulators import lqr, region_of_attraction, regulated
 from dln_jax.control.state_space import field_of, holding_controls, linearise
-from dln_jax.mechanics.dynamics import PlainDynamics
+from dln_jax.mechanics.dynamics import InverseForward
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.pendulums import cart_pole, rotary_pendulum, two_link_pendulum
 
@@ -55,7 +55,7 @@ def test_the_region_of_attraction_is_that_of_the_unstable_mode():
 def test_postures_that_cannot_be_held_and_plants_without_energy_are_refused():
     scene = cart_pole()
     plant, B = dynamics(scene.closed_form), scene.needs.actuation
-    plain = PlainDynamics(plant.inverse_dynamics, plant.forward_dynamics, plant.decompose)
+    plain = InverseForward(*plant[:2])
     for make, message in (
         (lambda: holding_controls(plant, [0.0, 0.3], B), "no controls hold the posture"),
         (lambda: linearise(field_of(plant, B), [0.0, 0.3, 0.0, 0.0], [0.0]), "not an equilibrium"),

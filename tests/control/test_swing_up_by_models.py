@@ -12,7 +12,7 @@ from dln_jax.control.desktop_plants import desktop_plant, law_of, model_of_plant
 from dln_jax.control.estimate.kalman import mechanical
 from dln_jax.control.plants.estimators import by_filter
 from dln_jax.control.swing_up import nearest_equilibrium, swing_up
-from dln_jax.mechanics.dynamics import PlainDynamics
+from dln_jax.mechanics.dynamics import InverseForward
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 
@@ -56,7 +56,7 @@ def test_models_that_cannot_be_used_are_refused():
     limits = {"lower": PLANT.hardware.lower, "upper": PLANT.hardware.upper}
     needs = PLANT.scene.needs
     for model, message in (
-        (PlainDynamics(NOMINAL.inverse_dynamics, NOMINAL.forward_dynamics, NOMINAL.decompose), "has no energy"),
+        (InverseForward(*NOMINAL[:2]), "has no energy"),
         (dynamics(indefinite), "not positive definite"),
         (with_potential(lambda q: 0.1 * q[1]), "no equilibrium near the goal"),
         (with_potential(lambda q: 0.2 * q[0]), "do not hold the goal"),  # the motor is too weak

@@ -16,7 +16,7 @@ from dln_jax.control.tracking import (
 )
 from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.integrators import CLASSICAL, rollout, runge_kutta, second_order
+from dln_jax.mechanics.integrators import rk4, rollout, second_order
 from dln_jax.scenes.pendulums import two_link_arm
 
 ARM = dynamics(two_link_arm().energies)
@@ -34,7 +34,7 @@ def errors(law, off):
     """Errors of the coordinates along the closed loop, from a start that deviates by `off`."""
     field = second_order(lambda t, q, qd: ARM.forward_dynamics(q, qd, law(q, qd, reference(t))))
     start = reference(0.0)
-    q, _ = jax.jit(lambda start: rollout(runge_kutta(CLASSICAL, field), start, T))((start.q + off, start.qd))
+    q, _ = jax.jit(lambda start: rollout(rk4(field), start, T))((start.q + off, start.qd))
     return q - jax.vmap(lambda t: reference(t).q)(T)
 
 

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax import LagrangianSystem, dynamics
 from dln_jax.data import schema
-from dln_jax.mechanics.dynamics import PlainDynamics
+from dln_jax.mechanics.dynamics import InverseForward
 from dln_jax.metrics.motions import (
     Motion,
     by_trajectory,
@@ -125,7 +125,7 @@ def test_the_true_plant_predicts_its_own_motions_and_another_does_not():
     assert metrics_of_motions(motions, energies.at[1, 0, 1].set(jnp.nan), data)["energy_error_j"] == np.inf
     # A model without an energy is rolled out as well.
     oscillator = damped_oscillator()
-    plain = PlainDynamics(oscillator.inverse_dynamics, oscillator.forward_dynamics, oscillator.decompose)
+    plain = InverseForward(*oscillator[:2])
     other = rollout_metrics(plain, data)
     assert 0 < other["vpt_interpolated_seconds"] < 0.6
     assert other["normalised_state_error"] > 0.1

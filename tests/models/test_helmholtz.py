@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from calls import one_line
 
-from dln_jax.mechanics.dynamics import Flow, PlainFlow
+from dln_jax.mechanics.dynamics import Flow, PhaseRates
 from dln_jax.mechanics.equations import flow
 from dln_jax.models.baselines import make_helmholtz
 from dln_jax.types import Needs
@@ -27,7 +27,7 @@ def jacobian(rates, x):
 def test_each_part_lacks_what_it_must():
     x = jnp.array([0.3, -0.8, 0.5, 1.1])
     solenoidal, conservative, both = (random_field(each) for each in ("solenoidal", "conservative", "both"))
-    assert isinstance(solenoidal, Flow) and isinstance(both, Flow) and isinstance(conservative, PlainFlow)
+    assert isinstance(solenoidal, Flow) and isinstance(both, Flow) and isinstance(conservative, PhaseRates)
     J, C, B = (jacobian(each.rates, x) for each in (solenoidal, conservative, both))
     assert abs(jnp.trace(J)) < 1e-14 and jnp.abs(J - J.T).max() > 1e-3
     np.testing.assert_allclose(C, C.T, atol=1e-14)

@@ -10,7 +10,7 @@ from calls import one_line
 from conftest import slow_among
 
 from dln_jax.mechanics import hamiltonian, lagrangian
-from dln_jax.mechanics.dynamics import PlainDynamics
+from dln_jax.mechanics.dynamics import InverseForward
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.metrics.errors import definiteness
@@ -131,7 +131,7 @@ def test_scales_divide_what_enters_and_multiply_what_leaves():
 def test_feed_forward_has_no_energy():
     model = make_feed_forward(MIXED, **SMALL)
     system = dynamics(model.energies(drawn(model)))
-    assert isinstance(system, PlainDynamics)
+    assert isinstance(system, InverseForward)
     q, qd, qdd = jax.random.normal(jax.random.key(8), (3, 2))
     parts, rest, tau = system.decompose(q, qd, qdd), jnp.zeros(2), system.inverse_dynamics
     gravity = tau(q, rest, rest)

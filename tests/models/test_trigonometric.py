@@ -11,8 +11,8 @@ from calls import one_line
 from dln_jax.control.desktop_plants import desktop_plant
 from dln_jax.data.splits import split
 from dln_jax.learning.linear import choose_degrees, fit_linear
-from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.explicit import closed_form
 from dln_jax.models.model import Model
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.scenes.datasets.generators import uniform
@@ -88,7 +88,7 @@ def test_precision_does_not_depend_on_the_caller():
 def nonlinear() -> Model:
     def energies(parameters):
         mass = jnp.diag((1 + parameters) ** 2)
-        return ClosedForm(lambda q: mass, lambda q, qd: 0 * qd)
+        return closed_form(lambda q: mass, lambda q, qd: 0 * qd)
 
     return Model(lambda key: jnp.zeros(2), energies)
 

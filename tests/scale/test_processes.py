@@ -12,7 +12,7 @@ from calls import one_line
 from interpreters import Program, interpreters
 from safetensors.numpy import load_file
 
-from dln_jax.scale import Membership, membership
+from dln_jax.scale import membership
 
 TINY = '''
 """A command that iterates a map; every step needs all devices, and a process may be lost."""
@@ -255,9 +255,9 @@ REFUSED = [
 
 
 def test_options_are_a_membership_and_go_before_a_cluster():
-    assert membership(2, "node1:5000", 1, TASK) == Membership("node1:5000", 2, 1)
-    assert membership(2, "[fe80::1]:5000", 1, {}) == Membership("[fe80::1]:5000", 2, 1)
-    assert membership(None, None, None, TASK) == Membership()
+    assert membership(2, "node1:5000", 1, TASK) == ("node1:5000", 2, 1)
+    assert membership(2, "[fe80::1]:5000", 1, {}) == ("[fe80::1]:5000", 2, 1)
+    assert membership(None, None, None, TASK) == (None, None, None)
     assert membership(None, None, None, {}) is None
     assert membership(1, None, None, TASK) is None
     assert membership(None, None, None, {"SLURM_STEP_NUM_TASKS": "1"}) is None

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from calls import one_line
 
-from dln_jax.mechanics import closed_form, lagrangian
+from dln_jax.mechanics import lagrangian
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.pendulums import (
     cart_pole,
     chain,
@@ -78,7 +79,7 @@ def test_the_arm_has_the_published_constants_from_either_zero():
     second += 0.5 * s * 0.7**2 + 1.5 * np.cos(0.3 - 1.1)
     for arm, zero in ((two_link_arm(), 0.0), (two_link_arm(zero="hanging"), jnp.pi / 2)):
         shifted = q + jnp.array([zero, 0.0])
-        got = closed_form.inverse_dynamics(arm.closed_form, shifted, qd, qdd)
+        got = dynamics(arm.closed_form).inverse_dynamics(shifted, qd, qdd)
         np.testing.assert_allclose(got, [first, second], rtol=1e-13)
         np.testing.assert_allclose(arm.tip(shifted), two_link_arm().tip(q), rtol=1e-12)
 

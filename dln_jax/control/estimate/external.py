@@ -26,7 +26,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.solvers.lapack import symmetric_eigen
 from dln_jax.types import InputError, Scalar, Vector, require_positive
 
@@ -40,7 +40,7 @@ Observer = tuple[Any, Callable[[Any, Vector, Vector, Vector], tuple[Any, Array]]
 """First memory, and (memory, q, qd, tau held since the previous sample) -> (memory, r at this sample); pure."""
 
 
-def momentum_observer(model: Dynamics | PlainDynamics, d: int, *, rate: float, gain: Any) -> Observer:
+def momentum_observer(model: Dynamics | InverseForward, d: int, *, rate: float, gain: Any) -> Observer:
     """Returns a momentum observer of a natural system.
 
     Args:

@@ -28,7 +28,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from dln_jax.control.state_space import field_of, integrated
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.types import InputError, Scalar, require_positive
 
 
@@ -70,7 +70,7 @@ class Innovation(NamedTuple):
 
 
 def mechanical(
-    model: Dynamics | PlainDynamics,
+    model: Dynamics | InverseForward,
     actuation: Any = None,
     *,
     rate: float,

@@ -20,7 +20,7 @@ from dln_jax.control.estimate.kalman import Belief, Process, belief, filtered, m
 from dln_jax.data.encoders.sampling import delay_held, held_at_equal_steps, noise_of, step_of, timing
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import segments
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.types import InputError, Scalar
 
 SAMPLES = 4000
@@ -86,7 +86,7 @@ def tuned(process: Process, logs: list[tuple[Belief, Any, Any]]) -> Process:
 
 
 def from_log(
-    model: Dynamics | PlainDynamics,
+    model: Dynamics | InverseForward,
     log: Trajectories,
     *,
     actuation: Any = None,

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, circles, optimal_control, rates
 from dln_jax.control.optimal.worst_case import Disturbance
-from dln_jax.mechanics.integrators import CLASSICAL, advance, runge_kutta
+from dln_jax.mechanics.integrators import advance, rk4
 from dln_jax.types import Scalar, require_positive
 
 Flow = Callable[..., tuple[Array, Scalar]]
@@ -87,7 +87,7 @@ def flow(problem: ControlProblem, dt: float, *, substeps: int = 1, clipped: bool
             x, _ = state
             return field(x, u) + change, jnp.exp(-rho * t) * (problem.state_cost(x) + spent)
 
-        after, cost = advance(runge_kutta(CLASSICAL, rate), 0.0, (x, jnp.zeros((), x.dtype)), dt, substeps=substeps)
+        after, cost = advance(rk4(rate), 0.0, (x, jnp.zeros((), x.dtype)), dt, substeps=substeps)
         return (jnp.clip(after, low.astype(x.dtype), high.astype(x.dtype)) if clipped else after), cost
 
     return step

@@ -30,8 +30,8 @@ from dln_jax.control.optimal.problem import ControlProblem, checked, from_plant
 from dln_jax.control.plants.plant import ACTIVE_SPREAD, SPREAD, Layout
 from dln_jax.control.state_space import field_of, holding_controls
 from dln_jax.control.swing_up import nearest_equilibrium
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
-from dln_jax.mechanics.integrators import CLASSICAL
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
+from dln_jax.mechanics.integrators import rk4
 from dln_jax.nn.activations import softplus
 from dln_jax.types import InputError, JointKind, Scalar
 
@@ -84,7 +84,7 @@ class OwnProblem:
 
 
 def own_problem(
-    model: Dynamics | PlainDynamics,
+    model: Dynamics | InverseForward,
     layout: Layout,
     *,
     effort: float | None = None,
@@ -151,7 +151,7 @@ def own_problem(
 
 
 def _rates(
-    model: Dynamics | PlainDynamics, goal: np.ndarray, B: np.ndarray, size: np.ndarray
+    model: Dynamics | InverseForward, goal: np.ndarray, B: np.ndarray, size: np.ndarray
 ) -> tuple[float, np.ndarray]:
     """Returns the rate of the fall from the goal, 1/s, and accelerations [d] by each joint's own motor at its limit."""
     field, d, still = field_of(model), len(goal), jnp.zeros(len(goal))
@@ -183,7 +183,7 @@ def _finite(number: float) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def own_plant(model: Dynamics | PlainDynamics, numbers: OwnProblem) -> ValuePlant:
+def own_plant(model: Dynamics | InverseForward, numbers: OwnProblem) -> ValuePlant:
     """Returns the control problem with its evaluation.
 
     The evaluation starts near hanging, or at rest anywhere on circles and in a third of other sides of the box. It
@@ -226,7 +226,7 @@ def own_plant(model: Dynamics | PlainDynamics, numbers: OwnProblem) -> ValuePlan
         [*numbers.hanging, *np.zeros(d)], [*spread**2, *(still**2)], [*np.where(turning, np.pi, half[:d] / 3), *still]
     )
     evaluation = Evaluation(
-        rate=20 * scale, seconds=HORIZON / scale, held=1, method=CLASSICAL, clipped=False, near=NEAR,
+        rate=20 * scale, seconds=HORIZON / scale, held=1, method=rk4, clipped=False, near=NEAR,
         positions=ranges if np.isfinite(ranges).any() else None,
     )  # fmt: skip
     angles = tuple(k for k, kind in enumerate(numbers.joints) if kind == "revolute")

@@ -26,9 +26,9 @@ from dln_jax.control.optimal.fitted import Iteration
 from dln_jax.control.optimal.flow import limits
 from dln_jax.control.optimal.problem import ControlProblem, from_plant, rates
 from dln_jax.control.state_space import Law, circular, error
-from dln_jax.mechanics import closed_form
-from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.integrators import Tableau, runge_kutta
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.explicit import ExplicitSystem, closed_form
+from dln_jax.mechanics.integrators import Method, explicit_euler
 from dln_jax.nn.activations import softplus
 from dln_jax.scenes.pendulums import cart_pole, rotary_pendulum
 from dln_jax.types import JointKind, Scalar
@@ -37,7 +37,6 @@ MARGIN = 1e-3
 """Margin of the action cost's range beyond the limit."""
 HORIZON = 5.0
 """Time until a cost has the weight `share`, s."""
-EULER = Tableau(((0.0,),), (1.0,))
 Where = Literal["down", "uniform"]
 
 
@@ -59,7 +58,7 @@ class Evaluation(NamedTuple):
     seconds: float = 5.0
     held: int = 2
     """Steps for which a control is held."""
-    method: Tableau = EULER
+    method: Method = explicit_euler
     clipped: bool = True
     """Whether states that are not on a circle are clipped to the box; otherwise a run that leaves `positions` fails."""
     positions: Any = None
@@ -105,7 +104,7 @@ class Returns(NamedTuple):
 def pendulum() -> ValuePlant:
     """Returns a driven rod of 1 kg and 1 m: thdd = 3 (u + g/2 sin θ). Its 2.5 N m are too weak to lift it at once."""
     weight = 9.81 / 2
-    rod = ClosedForm(
+    rod = closed_form(
         lambda q: jnp.full((1, 1), 1 / 3, q.dtype),
         lambda q, qd: jnp.zeros_like(q),
         lambda q: weight * jnp.cos(q[0]),
@@ -180,7 +179,7 @@ def evaluate(plant: ValuePlant, law: Law, x: Any) -> Returns:
     def sample(carry: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         x, total = carry
         u = jnp.clip(law(x), -plant.limit, plant.limit)
-        step = runge_kutta(how.method, lambda t, x: field(x, u))
+        step = how.method(lambda t, x: field(x, u))
         for _ in range(how.held):
             total = total - dt * (problem.state_cost(x) + plant.rest + problem.action_cost.cost(u))
             x = jnp.clip(step(0.0, x, dt), low, high)
@@ -204,7 +203,7 @@ def evaluate(plant: ValuePlant, law: Law, x: Any) -> Returns:
 
 
 def _problem(
-    plant: ClosedForm,
+    plant: ExplicitSystem,
     actuation: Sequence[Sequence[float]] | None,
     joints: tuple[JointKind, ...],
     weights: Sequence[float],
@@ -214,7 +213,7 @@ def _problem(
     box: Sequence[float],
     penalised: Sequence[float] | None = None,
 ) -> ControlProblem:
-    a, B = from_plant(closed_form.dynamics(plant), actuation)
+    a, B = from_plant(dynamics(plant), actuation)
     angles = circular(joints, len(box))
 
     def ways(x: Any) -> list[Any]:

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 
 from dln_jax.control.optimal.action_costs import ActionCost, centred
 from dln_jax.control.state_space import Field, Law, circular, field_of, where_finite
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.types import InputError, JointKind, Scalar
 
 ValueAndGradient = Callable[[Array], tuple[Scalar, Array]]
@@ -58,7 +58,7 @@ class Affine(NamedTuple):
     actuation: Callable[[Array], Array]
 
 
-def from_plant(plant: Dynamics | PlainDynamics, actuation: Any = None) -> Affine:
+def from_plant(plant: Dynamics | InverseForward, actuation: Any = None) -> Affine:
     """Returns a and B of a mechanical system, on x = (q, qd), whose accelerations are affine in the forces.
 
     Args:

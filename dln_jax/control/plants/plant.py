@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from dln_jax.control.closed_loop import Hardware, encoded
 from dln_jax.control.state_space import field_of, integrated
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.types import InputError, JointKind, Needs, require_positive
 
 
@@ -208,7 +208,7 @@ def spread_of(layout: Layout) -> np.ndarray:
 
 
 def plant_of(
-    model: Dynamics | PlainDynamics,
+    model: Dynamics | InverseForward,
     layout: Layout,
     *,
     substeps: int = 2,

@@ -31,7 +31,7 @@ from dln_jax.control.plants.ways import RECOVERIES, Way, require_recovery
 from dln_jax.control.regulators import Regulator
 from dln_jax.control.state_space import error
 from dln_jax.control.swing_up import upright_of
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.types import InputError, require_positive, require_seed
 
 ERRORS = (0.0, 0.1, -0.1, 0.2, -0.2, 0.3, -0.3, 0.4)
@@ -82,7 +82,7 @@ class Tuned(NamedTuple):
 
 
 def tune(
-    model: Dynamics | PlainDynamics,
+    model: Dynamics | InverseForward,
     layout: Layout,
     hardware: Hardware = Hardware(),  # noqa: B008
     *,
@@ -209,7 +209,7 @@ def _chosen(
 
 def trial_of(
     controller: Callable[[Any], Controller],
-    model: Dynamics | PlainDynamics,
+    model: Dynamics | InverseForward,
     layout: Layout,
     hardware: Hardware,
     *,

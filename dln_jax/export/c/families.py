@@ -37,7 +37,7 @@ from jax.typing import DTypeLike
 from dln_jax.data.joints import needs_from_json
 from dln_jax.mechanics import discrete, jacobians
 from dln_jax.mechanics.discrete import ITERATIONS, Actuation
-from dln_jax.mechanics.dynamics import Dynamics, Flow, PhaseRates, PlainFlow
+from dln_jax.mechanics.dynamics import Dynamics, Flow, PhaseRates
 from dln_jax.mechanics.equations import Canonical, Driven, System, dynamics, flow
 from dln_jax.mechanics.jacobians import Natural
 from dln_jax.mechanics.joint_friction import LoadedSystem
@@ -217,7 +217,7 @@ def _of_uncertainty(model: Model, parameters: Any, known: Uncertainty) -> Named:
     return {"torque_std": _named(std, "tau_std"), "out_of_distribution": _named(flag, "out_of_distribution")}
 
 
-def _of_flow(system: Flow | PlainFlow, iterations: int) -> Named:
+def _of_flow(system: Flow | PhaseRates, iterations: int) -> Named:
     functions = _with_derivatives("rates", _named(system.rates, "qd", "pd"))
     if isinstance(system, Flow):
         functions |= _with_derivatives("hamiltonian", _named(system.energy, "H"))

@@ -21,7 +21,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from dln_jax.learning.kinematics.frames import Frames, displace, free_directions
-from dln_jax.mechanics.trees.scanned import Skeleton, scanned_forces, scanned_regressor
+from dln_jax.mechanics.trees.description import Tree
+from dln_jax.mechanics.trees.scanned import scanned_forces, scanned_regressor
 from dln_jax.precision import compiled
 from dln_jax.types import JointKind, Vector
 
@@ -54,9 +55,9 @@ class Structure(NamedTuple):
     velocity_scale: float
     """Velocity scale of dry friction, 1/s or m/s."""
 
-    def skeleton(self, frames: Frames) -> Skeleton:
+    def tree(self, frames: Frames, inertias: Any = None) -> Tree:
         """The tree with these frames; gravity points against z."""
-        return Skeleton(self.parents, self.joints, (0.0, 0.0, -self.acceleration), *frames)
+        return Tree(self.parents, self.joints, *frames, None, inertias, None, (0.0, 0.0, -self.acceleration))
 
     @property
     def inertial(self) -> np.ndarray:
@@ -92,7 +93,7 @@ class Projection(NamedTuple):
 def design(structure: Structure, frames: Frames, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d P"]:
     """Phi of one state, unscaled."""
     d = q.shape[0]
-    regressor = scanned_regressor(structure.skeleton(frames), q, qd, qdd)
+    regressor = scanned_regressor(structure.tree(frames), q, qd, qdd)
     columns = [regressor.reshape(d, 10 * d)[:, structure.inertial], jnp.diag(qdd)]
     if structure.friction:
         columns += [jnp.diag(qd), jnp.diag(jnp.tanh(qd / structure.velocity_scale)), jnp.eye(d, dtype=q.dtype)]
@@ -132,7 +133,7 @@ def project(
     inertias = inertias_of(structure, linear)
 
     def force(step: Array, *state: Vector) -> Vector:
-        return scanned_forces(structure.skeleton(displace(frames, step)), inertias, *state) / unit
+        return scanned_forces(structure.tree(displace(frames, step), inertias), *state) / unit
 
     still = jnp.zeros((tau.shape[1], 6), tau.dtype)
     places = free_directions(structure.parents, structure.joints)
@@ -178,8 +179,7 @@ def make_program(structure: Structure, *, ridge: float) -> Program:
         at = project(structure, frames, samples, unit, ridge=ridge)
         lower = at.loss < state.at.loss  # false for NaN
         damping = jnp.clip(state.damping * jnp.where(lower, FEWER, MORE), LEAST_DAMPING, MOST_DAMPING)
-        before = (state.frames, state.at)
-        frames, at = jax.tree.map(lambda new, old: jnp.where(lower, new, old), (frames, at), before)
+        frames, at = jax.tree.map(lambda new, old: jnp.where(lower, new, old), (frames, at), state[:2])
         return Descent(frames, at, damping)
 
     def iterate(state: Descent, samples: Samples, unit: Array) -> Descent:
@@ -199,7 +199,7 @@ def descend(
     expired: Callable[[], bool] = lambda: False,
 ) -> Descent:
     """Iterates until the loss settles, no step descends, or the iterations or the time are used up."""
-    samples, unit = jax.tree.map(jnp.asarray, samples), jnp.asarray(unit)
+    samples, unit = jax.tree.map(jnp.asarray, (samples, unit))
     directions = len(free_directions(structure.parents, structure.joints))
     # The first iteration only evaluates the frames: without a slope there is no step.
     at = Projection(

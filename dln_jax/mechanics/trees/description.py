@@ -4,7 +4,6 @@ import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.mechanics.trees.inertia import Inertia, moved
@@ -138,9 +137,7 @@ def with_payload(tree: Tree, link: int, inertia: Inertia, *, rotation: Any = Non
     if not 0 <= link < tree.degrees_of_freedom:
         raise InputError(f"link is {link}; expected 0 to {tree.degrees_of_freedom - 1}")
     there = moved(inertia, np.eye(3) if rotation is None else rotation, np.zeros(3) if position is None else position)
-    if isinstance(tree.inertias, np.ndarray) and isinstance(there, np.ndarray):
-        return tree._replace(inertias=tree.inertias + there * (np.arange(len(tree.parents)) == link)[:, None])
-    return tree._replace(inertias=jnp.asarray(tree.inertias).at[link].add(there))
+    return tree._replace(inertias=tree.inertias + there * (np.arange(tree.degrees_of_freedom) == link)[:, None])
 
 
 def tree_to_json(tree: Tree) -> dict[str, Any]:

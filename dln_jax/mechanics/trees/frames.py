@@ -31,9 +31,8 @@ class Placed(NamedTuple):
 
 def aligned(tree: Tree) -> Tree:
     """Returns the same bodies and joints in frames whose joint axis is z; frames and payloads of links change."""
-    if not isinstance(tree.axes, np.ndarray) or np.array_equal(
-        tree.axes, np.tile([0.0, 0.0, 1.0], (len(tree.axes), 1))
-    ):
+    about_z = np.tile([0.0, 0.0, 1.0], (len(tree.axes), 1))
+    if not isinstance(tree.axes, np.ndarray) or np.array_equal(tree.axes, about_z):
         return tree
     turns = [_onto(axis) for axis in tree.axes]
     rotations, positions = [], []
@@ -46,8 +45,7 @@ def aligned(tree: Tree) -> Tree:
     inertias = [moved(theta, turn.T, np.zeros(3)) for theta, turn in zip(tree.inertias, turns, strict=True)]
     numpy = np if all(isinstance(part, np.ndarray) for part in (*rotations, *positions, *inertias)) else jnp
     rotations, positions, inertias = (numpy.stack(parts) for parts in (rotations, positions, inertias))
-    axes = np.tile([0.0, 0.0, 1.0], (len(turns), 1))
-    return tree._replace(rotations=rotations, positions=positions, inertias=inertias, axes=axes)
+    return tree._replace(rotations=rotations, positions=positions, inertias=inertias, axes=about_z)
 
 
 def _onto(axis: np.ndarray) -> np.ndarray:
@@ -107,15 +105,23 @@ def _product(matrix: Any, vector: Vector3) -> list[Any]:
 def cross(a: Any, b: Any) -> Vector3:
     """Returns a x b, without terms that are known to be zero."""
 
+    def product(x: Any, y: Any) -> Any:
+        return None if _is_zero(x) or _is_zero(y) else x * y
+
     def difference(i: int, j: int) -> Any:
-        terms = [(1, a[i], b[j]), (-1, a[j], b[i])]
-        kept = [(sign, x, y) for sign, x, y in terms if not (_is_zero(x) or _is_zero(y))]
-        if not kept:
-            return 0.0
-        total = kept[0][0] * (kept[0][1] * kept[0][2]) if kept[0][0] > 0 else -(kept[0][1] * kept[0][2])
-        return total - kept[1][1] * kept[1][2] if len(kept) == 2 else total
+        plus, minus = product(a[i], b[j]), product(a[j], b[i])
+        if minus is None:
+            return 0.0 if plus is None else plus
+        return -minus if plus is None else plus - minus
 
     return jnp.stack([jnp.asarray(difference(*pair)) for pair in ((1, 2), (2, 0), (0, 1))])
+
+
+def hat(v: Vector3) -> Float[Array, "3 3"]:
+    """Returns the matrix of v x."""
+    x, y, z = v
+    zero = jnp.zeros_like(x)
+    return jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
 
 
 def _is_zero(number: Any) -> bool:
@@ -128,10 +134,13 @@ def world_frames(tree: Tree, q: Vector) -> tuple[Float[Array, "d 3 3"], Float[Ar
     origins: list[Any] = []
     for link, (parent, kind) in enumerate(zip(tree.parents, tree.joints, strict=True)):
         axis = jnp.asarray(tree.axes[link], q.dtype)
-        turn, shift = (_turn(axis, q[link]), 0.0 * axis) if kind == "revolute" else (jnp.eye(3), axis * q[link])
         rotation = jnp.asarray(tree.rotations[link], q.dtype)
-        position = jnp.asarray(tree.positions[link], q.dtype) + rotation @ shift
-        rotation = rotation @ turn
+        position = jnp.asarray(tree.positions[link], q.dtype)
+        if kind == "revolute":  # by Rodrigues' formula
+            K = hat(axis)
+            rotation = rotation @ (jnp.eye(3, dtype=q.dtype) + jnp.sin(q[link]) * K + (1 - jnp.cos(q[link])) * K @ K)
+        else:
+            position = position + rotation @ (axis * q[link])
         if parent >= 0:
             position = origins[parent] + rotations[parent] @ position
             rotation = rotations[parent] @ rotation
@@ -168,11 +177,3 @@ def frame_jacobian(tree: Tree, link: int, point: Any = (0.0, 0.0, 0.0)) -> Calla
         return jnp.stack(columns, axis=1)
 
     return jacobian
-
-
-def _turn(axis: Vector3, angle: Array) -> Float[Array, "3 3"]:
-    """Rodrigues' rotation formula."""
-    x, y, z = axis
-    zero = jnp.zeros_like(x)
-    hat = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
-    return jnp.eye(3, dtype=axis.dtype) + jnp.sin(angle) * hat + (1 - jnp.cos(angle)) * hat @ hat

@@ -25,8 +25,8 @@ def inertial_parameters(mass: Any, centre: Any, about_centre: Any) -> Inertia:
         centre: centre of mass [3], m.
         about_centre: moments of inertia about the centre of mass [3, 3], kg m².
     """
-    m, c, about = _alike(mass, centre, about_centre)
-    return _joined(m, m * c, about + m * (c @ c * np.eye(3) - c[:, None] * c))
+    numpy, m, c, about = _alike(mass, centre, about_centre)
+    return _joined(numpy, m, m * c, about + m * (c @ c * np.eye(3) - c[:, None] * c))
 
 
 def parts(theta: Inertia) -> tuple[Any, Any, Any]:
@@ -36,12 +36,12 @@ def parts(theta: Inertia) -> tuple[Any, Any, Any]:
 
 def moved(theta: Inertia, rotation: Any, position: Any) -> Inertia:
     """Returns theta of a body in a frame where its own frame has this rotation (columns are its axes) and position."""
-    own, R, r = _alike(theta, rotation, position)
+    numpy, own, R, r = _alike(theta, rotation, position)
     m, h, moments = parts(own)
     turned = R @ h
     shifted = (2 * (turned @ r) + m * (r @ r)) * np.eye(3)
     outer = turned[:, None] * r + r[:, None] * turned + m * r[:, None] * r
-    return _joined(m, turned + m * r, R @ moments @ R.T + shifted - outer)
+    return _joined(numpy, m, turned + m * r, R @ moments @ R.T + shifted - outer)
 
 
 def pseudo_inertia(theta: Inertia) -> Any:
@@ -49,26 +49,24 @@ def pseudo_inertia(theta: Inertia) -> Any:
 
     J = [[tr(I) / 2 - I, h], [hᵀ, m]]
     """
-    (own,) = _alike(theta)
+    numpy, own = _alike(theta)
     m, h, moments = parts(own)
-    numpy = np if isinstance(own, np.ndarray) else jnp
     spread = 0.5 * numpy.trace(moments) * np.eye(3) - moments
     return numpy.block([[spread, h[:, None]], [h[None, :], m.reshape(1, 1)]])
 
 
 def body_of_pseudo_inertia(J: Any) -> Inertia:
     """Returns theta of the body whose `pseudo_inertia` is J [4, 4]."""
-    (own,) = _alike(J)
-    numpy = np if isinstance(own, np.ndarray) else jnp
-    return _joined(own[3, 3], own[:3, 3], numpy.trace(own[:3, :3]) * np.eye(3) - own[:3, :3])
+    numpy, own = _alike(J)
+    return _joined(numpy, own[3, 3], own[:3, 3], numpy.trace(own[:3, :3]) * np.eye(3) - own[:3, :3])
 
 
-def _joined(m: Any, h: Any, moments: Any) -> Any:
-    numpy = np if isinstance(moments, np.ndarray) else jnp
+def _joined(numpy: Any, m: Any, h: Any, moments: Any) -> Any:
     return numpy.concatenate([m.reshape(1), h, moments[_ROWS, _COLUMNS]])
 
 
 def _alike(*arrays: Any) -> list[Any]:
-    """Converts all to NumPy arrays, or all to JAX arrays if any is one."""
-    learned = any(isinstance(array, Array) for array in arrays)
-    return [jnp.asarray(array) if learned else np.asarray(array, float) for array in arrays]
+    """Returns JAX if any is one of its arrays, NumPy otherwise, and all as arrays of it."""
+    if any(isinstance(array, Array) for array in arrays):
+        return [jnp, *map(jnp.asarray, arrays)]
+    return [np, *(np.asarray(array, float) for array in arrays)]

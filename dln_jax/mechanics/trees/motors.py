@@ -39,11 +39,8 @@ def armature_matrix(inertias: Any, rates: Any = None, coupling: Mapping[Pair, An
     """Returns A [d, d], or I [d] unchanged if every motor turns only with its own joint; NumPy if all is known."""
     if rates is None and not coupling:
         return inertias
-    entries = (coupling or {}).items()
-    learned = any(isinstance(value, Array) for value in (inertias, *(value for _, value in entries)))
-    numpy = jnp if learned else np
-    A = numpy.diag(numpy.asarray(inertias))
-    for (i, j), value in entries:
+    A = np.eye(len(inertias)) * inertias
+    for (i, j), value in (coupling or {}).items():
         place = np.zeros(A.shape)
         place[i, j] = place[j, i] = 1.0
         A = A + value * place

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dln_jax.mechanics.closed_form import RecursiveSystem
-from dln_jax.mechanics.lagrangian import LagrangianSystem
+from dln_jax.mechanics.explicit import ExplicitSystem
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.frames import Placed, aligned, cross, inwards, outwards, placed
 from dln_jax.mechanics.trees.inertia import parts
@@ -29,14 +28,13 @@ def newton_euler(tree: Tree, q: Vector, qd: Vector, qdd: Vector) -> Vector:
     for link, (parent, frame) in enumerate(zip(tree.parents, frames, strict=True)):
         w, dw, a = _on_parent(motions[parent] if parent >= 0 else None, frame, tree.gravity)
         rate, change = qd[link], qdd[link]
-        if tree.joints[link] == "revolute":
-            spin = rate if w is None else w[2] + rate
-            turning = jnp.zeros(2, q.dtype) if w is None else jnp.stack([w[1] * rate, -w[0] * rate])
-            dw = jnp.append(turning, change) if dw is None else dw + jnp.append(turning, change)
-            w = jnp.append(jnp.zeros(2, q.dtype) if w is None else w[:2], spin)
+        across = jnp.zeros(2, q.dtype) if w is None else jnp.stack([w[1] * rate, -w[0] * rate])
+        if tree.joints[link] == "prismatic":
+            a = a + jnp.append(2 * across, change)
+        elif w is None:
+            w, dw = jnp.append(across, rate), jnp.append(across, change)
         else:
-            coriolis = jnp.zeros(2, q.dtype) if w is None else 2 * jnp.stack([w[1] * rate, -w[0] * rate])
-            a = a + jnp.append(coriolis, change)
+            w, dw = jnp.append(w[:2], w[2] + rate), dw + jnp.append(across, change)
         motions.append((w, dw, a))
         forces.append(_force(tree.inertias[link], w, dw, a))
     tau: list[Any] = [None] * len(frames)
@@ -171,23 +169,18 @@ def potential_energy(tree: Tree, q: Vector) -> Scalar:
 
 
 def lagrangian(tree: Tree) -> Lagrangian:
-    """Returns L(q, qd) = T - V; all dynamics follow from it."""
+    """Returns L(q, qd) = T - V; its `LagrangianSystem` equals `tree_system`, but is slower."""
     return lambda q, qd: kinetic_energy(tree, q, qd) - potential_energy(tree, q)
 
 
-def tree_energies(tree: Tree, dissipation: Dissipation | None = None) -> LagrangianSystem:
-    """Returns a record of the Lagrangian alone, with derivatives as forces; equivalent to `tree_system`, but slower."""
-    return LagrangianSystem(lagrangian(tree), dissipation)
-
-
-def tree_system(tree: Tree, dissipation: Dissipation | None = None) -> RecursiveSystem:
+def tree_system(tree: Tree, dissipation: Dissipation | None = None) -> ExplicitSystem:
     """Returns the record for `equations.dynamics`, with forces by recursions.
 
     Args:
         tree: a tree of known or learned numbers.
         dissipation: (q, qd) -> Rayleigh function.
     """
-    return RecursiveSystem(
+    return ExplicitSystem(
         mass_matrix=lambda q: composite_bodies(tree, q),
         forces=lambda q, qd, qdd: newton_euler(tree, q, qd, qdd),
         potential=(lambda q: potential_energy(tree, q)) if tree.needs.gravity else None,

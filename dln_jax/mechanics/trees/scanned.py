@@ -1,13 +1,10 @@
 """Forces of a tree with learned frames, by one scan over its links: quick to compile and to differentiate.
 
-`recursions` unrolls the links, so that zeros of known frames cost nothing. Here no frame is known. In every link's
-frame the scan carries the link's motions for unit rates of the joints (the columns of its Jacobian), its own motion
-and its acceleration, all as spatial vectors (Featherstone, Rigid Body Dynamics Algorithms, 2008). The forces of the
-links are then independent.
+`recursions` unrolls the links, so that zeros of known frames cost nothing. Here no frame is known, and every joint is
+about z of its link, whatever the tree's axes. In every link's frame the scan carries the link's motions for unit rates
+of the joints (the columns of its Jacobian), its own motion and its acceleration, all as spatial vectors (Featherstone,
+Rigid Body Dynamics Algorithms, 2008). The forces of the links are then independent.
 """
-
-from collections.abc import Sequence
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,40 +12,28 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float
 
+from dln_jax.mechanics.trees.description import Tree
+from dln_jax.mechanics.trees.frames import hat
 from dln_jax.mechanics.trees.inertia import parts
-from dln_jax.types import JointKind, Vector
+from dln_jax.types import Vector
 
 
-class Skeleton(NamedTuple):
-    """Links and joints of a tree, without inertias; every joint is about z of its link."""
-
-    parents: Sequence[int]
-    """As in `Tree`."""
-    joints: Sequence[JointKind]
-    gravity: Any
-    """[3], m/s²."""
-    rotations: Any
-    """[d, 3, 3], rotations of the links at q = 0 relative to their parent links."""
-    positions: Any
-    """[d, 3], positions of the links relative to their parent links, m."""
-
-
-def scanned_regressor(skeleton: Skeleton, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d d 10"]:
+def scanned_regressor(tree: Tree, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d d 10"]:
     """Returns d tau / d theta: joint forces for unit inertial parameters of the links, without armature."""
 
     def of_link(angular: Array, linear: Array) -> Array:
         w, dw, a = _motion(angular, linear)
-        turning = _hat(w)
-        force = jnp.concatenate([a[:, None], _hat(dw) + turning @ turning], axis=1)
-        moment = jnp.concatenate([-_hat(a), _moments(dw) + turning @ _moments(w)], axis=1)
+        turning = hat(w)
+        force = jnp.concatenate([a[:, None], hat(dw) + turning @ turning], axis=1)
+        moment = jnp.concatenate([-hat(a), _moments(dw) + turning @ _moments(w)], axis=1)
         by_force, by_moment = linear[:, :-2].T @ force, angular[:, :-2].T @ moment
         return jnp.pad(by_force, ((0, 0), (0, 6))) + jnp.pad(by_moment, ((0, 0), (1, 0)))
 
-    return jnp.swapaxes(jax.vmap(of_link)(*_spatial(skeleton, q, qd, qdd)), 0, 1)
+    return jnp.swapaxes(jax.vmap(of_link)(*_spatial(tree, q, qd, qdd)), 0, 1)
 
 
-def scanned_forces(skeleton: Skeleton, inertias: Any, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-    """Returns tau [d] of links with inertial parameters `inertias` [d, 10], like `newton_euler` without armature."""
+def scanned_forces(tree: Tree, q: Vector, qd: Vector, qdd: Vector) -> Vector:
+    """Returns the generalised force tau [d] of a motion, like `newton_euler` without armature."""
 
     def of_link(angular: Array, linear: Array, theta: Array) -> Array:
         w, dw, a = _motion(angular, linear)
@@ -57,28 +42,26 @@ def scanned_forces(skeleton: Skeleton, inertias: Any, q: Vector, qd: Vector, qdd
         moment = jnp.cross(h, a) + moments @ dw + jnp.cross(w, moments @ w)
         return linear[:, :-2].T @ force + angular[:, :-2].T @ moment
 
-    return jnp.sum(jax.vmap(of_link)(*_spatial(skeleton, q, qd, qdd), inertias), axis=0)
+    return jnp.sum(jax.vmap(of_link)(*_spatial(tree, q, qd, qdd), tree.inertias), axis=0)
 
 
-def _spatial(
-    skeleton: Skeleton, q: Vector, qd: Vector, qdd: Vector
-) -> tuple[Float[Array, "d 3 n"], Float[Array, "d 3 n"]]:
+def _spatial(tree: Tree, q: Vector, qd: Vector, qdd: Vector) -> tuple[Float[Array, "d 3 n"], Float[Array, "d 3 n"]]:
     """Returns angular and linear parts in the links' frames: d columns of the Jacobian, velocity, acceleration."""
-    parents, joints, gravity, rotations, positions = skeleton
+    parents, rotations = tree.parents, tree.rotations
     d = len(parents)
-    turns = np.array([kind == "revolute" for kind in joints], float)
+    turns = np.array([kind == "revolute" for kind in tree.joints], float)
     c, s = jnp.where(turns > 0, jnp.cos(q), 1.0), jnp.where(turns > 0, jnp.sin(q), 0.0)
     zero, one = jnp.zeros_like(c), jnp.ones_like(c)
     about_z = jnp.stack([jnp.stack(row, -1) for row in ([c, -s, zero], [s, c, zero], [zero, zero, one])], -2)
     into = jnp.swapaxes(rotations @ about_z, -1, -2)
-    places = positions + rotations[:, :, 2] * ((1 - turns) * q)[:, None]
-    ground = jnp.zeros((2, 3, d + 2), q.dtype).at[1, :, -1].set(-jnp.asarray(gravity, q.dtype))
+    places = tree.positions + rotations[:, :, 2] * ((1 - turns) * q)[:, None]
+    ground = jnp.zeros((2, 3, d + 2), q.dtype).at[1, :, -1].set(-jnp.asarray(tree.gravity, q.dtype))
     serial = tuple(parents) == tuple(range(-1, d - 1))
 
     def link(carried: Array, inputs: tuple[Array, ...]) -> tuple[Array, Array]:
         index, parent, into, place, turns, rate, change = inputs
         angular, linear = carried if serial else carried[parent]
-        linear = into @ (linear - _hat(place) @ angular)
+        linear = into @ (linear - hat(place) @ angular)
         angular = into @ angular
         own = (jnp.arange(d + 1) == index) + 0.0 * rate
         own = own.at[d].set(rate)
@@ -104,12 +87,6 @@ def _motion(angular: Array, linear: Array) -> tuple[Array, Array, Array]:
     """Returns angular velocity, its rate, and the acceleration of the link's origin."""
     w = angular[:, -2]
     return w, angular[:, -1], linear[:, -1] + jnp.cross(w, linear[:, -2])
-
-
-def _hat(v: Array) -> Array:
-    x, y, z = v
-    zero = jnp.zeros_like(x)
-    return jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
 
 
 def _moments(w: Array) -> Array:

@@ -14,8 +14,8 @@ from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories
 from dln_jax.errors import require_memory
 from dln_jax.files import cache_folder
-from dln_jax.mechanics import closed_form, lagrangian
-from dln_jax.mechanics.closed_form import ClosedForm
+from dln_jax.mechanics import lagrangian
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import adaptive_rollout, second_order
 from dln_jax.precision import in_float64
 from dln_jax.scenes.datasets.letters import LETTERS, letter_path, require_finite
@@ -188,11 +188,12 @@ def completed(scene: Scene, t, q, qd, qdd, trajectory, label) -> Trajectories:
         return jax.jvp(functools.partial(lagrangian.momentum, scene.lagrangian), (q, qd), (qd, qdd))
 
     # Compiled separately, since fusing them would change the last digits of the datasets.
-    tau = np.asarray(_batched(closed_form.inverse_dynamics, scene.closed_form)(q, qd, qdd))
-    parts = map(np.asarray, _batched(closed_form.decompose, scene.closed_form)(q, qd, qdd))
+    known = dynamics(scene.closed_form)
+    tau = np.asarray(jax.jit(jax.vmap(known.inverse_dynamics))(q, qd, qdd))
+    parts = map(np.asarray, jax.jit(jax.vmap(known.decompose))(q, qd, qdd))
     p, pd = map(np.asarray, _batched(momentum, scene)(q, qd, qdd))
     return Trajectories(t, q, qd, qdd, tau, trajectory, label, p, pd, *parts, needs=scene.needs)
 
 
-def _batched(function: Callable[..., Any], system: Scene | ClosedForm) -> Callable[..., Any]:
-    return jax.jit(jax.vmap(functools.partial(function, system)))
+def _batched(function: Callable[..., Any], scene: Scene) -> Callable[..., Any]:
+    return jax.jit(jax.vmap(functools.partial(function, scene)))

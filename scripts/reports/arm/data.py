@@ -11,7 +11,7 @@ from jax.typing import DTypeLike
 from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, select, split
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.mechanics.equations import Driven
 from dln_jax.mechanics.integrators import rollout, symplectic_euler
 from dln_jax.metrics.errors import as_arrays, prediction_program, samples_of
@@ -96,7 +96,7 @@ def predictions(
 
 
 def rollout_metrics(
-    dynamics: Dynamics | PlainDynamics, data: Trajectories, *, dtype: DTypeLike | None = None
+    dynamics: Dynamics | InverseForward, data: Trajectories, *, dtype: DTypeLike | None = None
 ) -> dict[str, float]:
     """Returns `metrics_of_motions` of a system's predictions from its first states and torques.
 

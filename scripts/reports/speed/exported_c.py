@@ -23,7 +23,7 @@ from dln_jax.export.c.interface import Signature, read_interface, stated_costs
 from dln_jax.export.c.load import FLAGS, STANDARD, compile_c, load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.discrete import linearised
-from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
+from dln_jax.mechanics.integrators import rk4
 from dln_jax.precision import data_type
 from dln_jax.scenes.pendulums import chain, two_link_arm
 from dln_jax.zoo.descriptions import build, describe
@@ -212,7 +212,7 @@ def textbook_rates() -> problems.Formula:
 def our_steps() -> dict[str, Any]:
     """The Runge-Kutta step with A and B, and examples of its arguments, by origin."""
     scene, rates = two_link_arm(), textbook_rates()
-    step = linearised(lambda x, u, dt: runge_kutta(CLASSICAL, lambda t, x: jnp.stack(rates(jnp, x, u)))(0.0, x, dt))
+    step = linearised(lambda x, u, dt: rk4(lambda t, x: jnp.stack(rates(jnp, x, u)))(0.0, x, dt))
 
     def formulas(x, u, dt):
         x_next, (A, B) = step(x, u, dt)

@@ -8,15 +8,15 @@ from calls import one_line
 from dln_jax.control.optimal.own_plants import own_plant, own_problem, own_settings
 from dln_jax.control.optimal.plants import evaluate, starts
 from dln_jax.control.plants.plant import layout
-from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.explicit import closed_form
 from dln_jax.scenes.pendulums import cart_pole
 
 
 def rod(length=1.0):
     """A driven rod of 1 kg."""
-    return closed_form.dynamics(
-        closed_form.ClosedForm(
+    return dynamics(
+        closed_form(
             lambda q: jnp.full((1, 1), length**2 / 3, q.dtype),
             lambda q, qd: jnp.zeros_like(q),
             lambda q: 9.81 * length / 2 * jnp.cos(q[0]),

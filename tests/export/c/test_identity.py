@@ -87,14 +87,14 @@ def test_what_is_left_out_leaves_nothing_behind():
 
 
 def test_precisions_may_follow_each_other_in_a_process(tmp_path):
-    system, q = chain(3).closed_form, np.array([0.3, -0.4, 0.5])
-    before = jax.jit(system.gravity)(q)
+    scene, q = chain(3), np.array([0.3, -0.4, 0.5])
+    before = jax.jit(scene.gravity)(q)
     texts = []
     for turn, (precision, dtype) in enumerate(2 * [("f64", np.float64), ("f32", np.float32)]):
-        functions = functions_of_system(system, 3, dtype=dtype)
+        functions = functions_of_system(scene.closed_form, 3, dtype=dtype)
         chosen = {"gravity_jacobian": functions["gravity_jacobian"]}
         texts.append(source_files(chosen, name="model", precision=precision))
-        np.testing.assert_array_equal(jax.jit(system.gravity)(q), before, err_msg=str(turn))
+        np.testing.assert_array_equal(jax.jit(scene.gravity)(q), before, err_msg=str(turn))
     assert texts[:2] == texts[2:]
     with jax.enable_x64(False):
         again = source_files(chosen, name="model", precision="f64")["model.c"]

@@ -1,13 +1,12 @@
 """The scan over links gives the forces of the recursions, for chains and trees, turning and sliding joints."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from dln_jax.mechanics.trees.description import make_tree
 from dln_jax.mechanics.trees.recursions import newton_euler
-from dln_jax.mechanics.trees.scanned import Skeleton, scanned_forces, scanned_regressor
+from dln_jax.mechanics.trees.scanned import scanned_forces, scanned_regressor
 
 KINDS = ("revolute", "prismatic", "revolute")
 
@@ -20,9 +19,8 @@ def test_forces_are_those_of_the_recursions(parents):
     positions, inertias, gravity = random.normal(size=(3, 3)), random.normal(size=(3, 10)), random.normal(size=3)
     tree = make_tree(parents, KINDS, rotations, positions, np.tile([0, 0, 1], (3, 1)), inertias, gravity=gravity)
     states = random.normal(size=(3, 5, 3))
-    known = Skeleton(parents, tree.joints, gravity, jnp.asarray(rotations), jnp.asarray(positions))
     expected = jax.jit(jax.vmap(lambda *state: newton_euler(tree, *state)))(*states)
-    forces = jax.jit(jax.vmap(lambda *state: scanned_forces(known, jnp.asarray(inertias), *state)))(*states)
+    forces = jax.jit(jax.vmap(lambda *state: scanned_forces(tree, *state)))(*states)
     np.testing.assert_allclose(forces, expected, atol=1e-11)
-    Phi = jax.jit(jax.vmap(lambda *state: scanned_regressor(known, *state)))(*states)
+    Phi = jax.jit(jax.vmap(lambda *state: scanned_regressor(tree, *state)))(*states)
     np.testing.assert_allclose(np.einsum("njip,ip->nj", Phi, inertias), expected, atol=1e-11)

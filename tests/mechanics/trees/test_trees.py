@@ -10,9 +10,10 @@ from conftest import slow_among
 from dln_jax import tree_system
 from dln_jax.mechanics import jacobians
 from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.trees.description import dh_frames, make_tree, serial, with_payload
 from dln_jax.mechanics.trees.inertia import inertial_parameters
-from dln_jax.mechanics.trees.recursions import newton_euler, regressor, tree_energies
+from dln_jax.mechanics.trees.recursions import lagrangian, newton_euler, regressor
 from dln_jax.scenes.pendulums import chain
 
 
@@ -53,7 +54,7 @@ ARM = random_tree((-1, 0), ("revolute",) * 2, axes=np.eye(3)[[2, 2]])
 @pytest.mark.parametrize("name", slow_among(TREES, lambda name: name == "branched"))
 def test_recursions_equal_derivatives_of_the_energies_and_are_linear_in_the_parameters(name):
     tree = TREES[name]
-    fast, slow = (dynamics(make(tree)) for make in (tree_system, tree_energies))
+    fast, slow = dynamics(tree_system(tree)), dynamics(LagrangianSystem(lagrangian(tree)))
 
     @jax.jit
     def answers(q, qd, qdd):
