@@ -215,7 +215,9 @@ def require_start(problem: TrajectoryProblem, x: Any, m: int) -> None:
             continue
         counted = fixed[one.components] if one.kind == "limit" else fixed.all()
         excess = _known(lambda x, one=one: one.values(x, None, *first), x)
-        for i in [] if excess is None else np.flatnonzero(counted & (excess > 0))[:1]:
+        if excess is None:
+            continue
+        for i in np.flatnonzero(counted & (excess > 0))[:1]:
             name = one.name.format(i=one.components[i], k=0)
             raise InputError(f"the start violates {name} by {excess[i]:.6g}; start where it holds")
 

@@ -212,13 +212,12 @@ def _solved(
     exceeded = (last.ending == Ending.CONVERGED) & (violation > HELD * tolerance)
     ending = jnp.select([outside, exceeded], [Ending.VIOLATED, Ending.EXCEEDED], last.ending)
     scale = scale / weight
-    cost = scale * values.cost
-    objective = cost + jnp.sum(jnp.where(kinds.soft, w_1 * excess + w_2 / 2 * excess**2, 0.0))
+    objective = scale * values.cost + jnp.sum(jnp.where(kinds.soft, w_1 * excess + w_2 / 2 * excess**2, 0.0))
     # After a search that minimised violations, feasibility does not count them.
     held = (weight == 1) & (residuals.feasibility <= HELD * tolerance)
     damping = jnp.asarray(FIRST_DAMPING, at.u.dtype)
     return Shooting(
-        Plan(at.u, at.x, last.change.K, cost, damping, jnp.asarray(True), ending),
+        Plan(at.u, at.x, last.change.K, scale * values.cost, damping, jnp.asarray(True), ending),
         scale * at.prices,
         scale * (at.nu + ended[0] - ended[1]),
         scale * pressures,

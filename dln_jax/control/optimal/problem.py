@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from dln_jax.control.optimal.action_costs import ActionCost, centred
+from dln_jax.control.optimal.action_costs import ActionCost
 from dln_jax.control.state_space import Field, Law, circular, field_of, where_finite
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.types import InputError, JointKind, Scalar
@@ -51,11 +51,8 @@ class ControlProblem(NamedTuple):
     """x0 [n], at rest without control."""
 
 
-class Affine(NamedTuple):
-    """dx/dt = a(x) + B(x) u."""
-
-    drift: Callable[[Array], Array]
-    actuation: Callable[[Array], Array]
+Affine = tuple[Callable[[Array], Array], Callable[[Array], Array]]
+"""a and B of dx/dt = a(x) + B(x) u."""
 
 
 def from_plant(plant: Dynamics | PlainDynamics, actuation: Any = None) -> Affine:
@@ -79,11 +76,8 @@ def from_field(field: Field, controls: int | None = None) -> Affine:
     def rest(x: Array) -> Array:
         return jnp.zeros(len(x) // 2 if controls is None else controls, x.dtype)
 
-    return Affine(
-        lambda x: field(x, rest(x)),
-        # The field is affine, so the derivative is the same at all controls.
-        lambda x: jax.jacfwd(lambda u: field(x, u))(rest(x)),
-    )
+    # The field is affine, so its derivative is the same at all controls.
+    return lambda x: field(x, rest(x)), lambda x: jax.jacfwd(lambda u: field(x, u))(rest(x))
 
 
 def rates(problem: ControlProblem) -> Field:
@@ -139,39 +133,6 @@ def checked(problem: ControlProblem, *, tolerance: float = 1e-6) -> ControlProbl
     if not abs(cost) <= tolerance:
         raise InputError(f"a second at the goal costs {cost:.3g}; expected none, as V is zero there")
     return problem._replace(low=low, high=high, goal=goal)
-
-
-def at_goal(problem: ControlProblem, goal: Any, *, tolerance: float = 1e-6) -> ControlProblem:
-    """Returns the problem with another goal.
-
-    The state cost is shifted, and controls cost their difference from the one that holds the new goal.
-
-    Args:
-        problem: with zero cost at its goal.
-        goal: state [n].
-        tolerance: largest remaining dx/dt.
-
-    Raises:
-        InputError: no control holds the goal, or none within the limits of the action cost.
-    """
-    goal, before = jnp.asarray(goal, float), jnp.asarray(problem.goal, float)
-    if goal.shape != before.shape:
-        raise InputError(f"the goal has shape {goal.shape}; expected {before.shape}, a state")
-    drift, B = jax.jit(lambda x: (problem.drift(x), problem.actuation(x)))(goal)
-    u = jnp.linalg.lstsq(B, -drift)[0]
-    moving = float(jnp.max(jnp.abs(drift + B @ u)))
-    if not moving <= tolerance:
-        raise InputError(
-            f"the goal is not an equilibrium: no control makes dx/dt less than {moving:.3g} there; give another"
-        )
-    cost = problem.state_cost
-    return checked(
-        problem._replace(
-            state_cost=lambda x: cost(x - (goal - before)),
-            action_cost=centred(problem.action_cost, u),
-            goal=np.asarray(goal),
-        )
-    )
 
 
 def circles(problem: ControlProblem) -> Bool[np.ndarray, " n"]:
