@@ -6,8 +6,8 @@ value.json (dln_jax.load(folder).value), metrics.json, config.json, and figures 
 closed loop. --out FOLDER --resume continues an interrupted run.
 
 --plant takes the name of a desktop plant or an MJCF or URDF file, and --run the folder of a learned or identified
-model. Costs, box and times come from the plant's natural scales and limits, and are printed. A law that does not bring its starts up is
-refused with exit status 1, unless your own --iterations ended the training.
+model. Costs, box and times come from the plant's natural scales and limits, and are printed. A law that does not bring
+its starts up is refused with exit status 1, unless your own --iterations ended the training.
 """
 
 from collections.abc import Mapping

@@ -12,9 +12,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from dln_jax.control.closed_loop import ClosedLoopRun, Hardware, outcomes, simulate, stateless
-from dln_jax.control.optimal.flow import limits
 from dln_jax.control.optimal.own_plants import HORIZON, NEAR, OwnProblem
-from dln_jax.control.optimal.problem import ControlProblem, rates
+from dln_jax.control.optimal.problem import ControlProblem, limits, rates
 from dln_jax.control.plants.simulated import ACTIVE_SPREAD, SPREAD
 from dln_jax.control.state_space import Law, error
 from dln_jax.figures import style

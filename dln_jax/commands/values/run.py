@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import math
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -14,12 +13,11 @@ from jax.sharding import Mesh
 
 from dln_jax.commands.values.evaluation import closed_loop, evaluation, value_plane, verdict_of
 from dln_jax.commands.values.plants import file_of, of_file, of_run, problem_of, uncertain_numbers
-from dln_jax.control.optimal.fitted import Iteration, IterationState, ValueProgress, fit_values
+from dln_jax.control.optimal.fitted import Iteration, fit_values
 from dln_jax.control.optimal.own_plants import described, own_settings
-from dln_jax.control.optimal.problem import ControlProblem, from_field
+from dln_jax.control.optimal.problem import ControlProblem, Disturbance, from_field, worst_disturbance
 from dln_jax.control.optimal.residual import discounts_down_to, fit_hjb
-from dln_jax.control.optimal.value_networks import ValueNetwork
-from dln_jax.control.optimal.worst_case import Bounds, Disturbance, worst_disturbance
+from dln_jax.control.optimal.value_networks import ValueFit, ValueNetwork, ValueProgress
 from dln_jax.files import finite
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.problem import Progress
@@ -75,8 +73,9 @@ def train(options: Any) -> None:
     names, altered = uncertain_numbers(model, own)
     disturbance, extremes = None, {}
     if options.robust:
-        bounds = Bounds(parameters=options.robust)
-        disturbance = worst_disturbance(lambda x, u, p: altered(p)(x, u), np.ones(len(names)), bounds)
+        disturbance = worst_disturbance(
+            lambda x, u, p: altered(p)(x, u), np.ones(len(names)), parameters=options.robust
+        )
         for extreme, sign in (("heavy_weak", options.robust), ("light_strong", -options.robust)):
             factors = jnp.array([1 - sign if of.startswith("strength") else 1 + sign for of in names], float)
             drift, actuation = from_field(altered(factors), len(own.limits))
@@ -98,13 +97,13 @@ def train(options: Any) -> None:
         if options.robust:
             print(f"robust against errors of {options.robust:.0%} of {' and '.join(dict.fromkeys(names))}")
         if options.method == "residual":
-            trained = by_equation(
+            fits = by_equation(
                 problem, network, options.iterations or ITERATIONS, seeds, mesh=mesh, disturbance=disturbance
             )
         else:
             iteration = iteration._replace(iterations=options.iterations or iteration.iterations)
             identity = [dataclasses.asdict(own), model.description, settings, iteration._asdict(), options.robust]
-            trained = by_iteration(
+            fits = by_iteration(
                 problem,
                 network,
                 iteration,
@@ -113,18 +112,19 @@ def train(options: Any) -> None:
                 mesh=mesh,
                 disturbance=disturbance,
             )
-        parameters, lowest, seconds = min(trained, key=lambda training: training[1])
+        best = min(fits, key=lambda fit: fit.validation)
         save(folder, model.description, model.parameters)
-        save_value(folder, name, settings, parameters, own)
-        metrics = {"train_seconds": seconds, "validation": lowest}
-        if len(trained) > 1:
-            _, validation, spent = zip(*trained, strict=True)
+        save_value(folder, name, settings, best.parameters, own)
+        seconds = [fit.train_seconds + fit.compile_seconds for fit in fits]
+        metrics = {"train_seconds": seconds[fits.index(best)], "validation": best.validation}
+        if len(fits) > 1:
+            validation = [fit.validation for fit in fits]
             metrics |= {
                 "validation_median": float(np.median(validation)),
-                "validation_worst": float(np.max(validation)),
-                "train_seconds_median": float(np.median(spent)),
+                "validation_worst": max(validation),
+                "train_seconds_median": float(np.median(seconds)),
             }
-        run = ValueRun(name, problem, own, network, with_float64(parameters))
+        run = ValueRun(name, problem, own, network, with_float64(best.parameters))
         finish(folder, options, report_of(run, options, metrics, extremes))
 
 
@@ -188,42 +188,38 @@ def by_iteration(
     *,
     mesh: Mesh | None,
     disturbance: Disturbance | None,
-) -> list[tuple[Any, float, float]]:
+) -> list[ValueFit]:
     """Fits value functions by fitted value iteration, one per seed; devices share the states.
 
     Every iteration is stored in the checkpoint of its seed; a stored seed is resumed bit for bit.
     """
-    before = 0
 
-    def start(seed: int, state: IterationState) -> IterationState:
-        nonlocal before
-        before = numbers.iterations * (seed - seeds.start)
-        if (stored := restore(checkpoint(seed), state[:3])) is None:
-            return state
-        tree, history = stored
-        done = [ValueProgress(at.step, at.loss, at.validation, at.seconds) for at in history]
-        return IterationState(*tree, history=done)
+    def stored(seed: int, like: Any) -> tuple[Any, list[ValueProgress]] | None:
+        if (found := restore(checkpoint(seed), like)) is None:
+            return None
+        state, history = found
+        return state, [ValueProgress(at.step, at.loss, at.validation, at.seconds, problem.discount) for at in history]
 
-    def keep(seed: int, state: IterationState) -> None:
-        history = [Progress(at.iteration, at.loss, at.validation, math.nan, at.seconds, "") for at in state.history]
-        store(checkpoint(seed), state[:3], history)
+    def keep(seed: int, state: Any, history: list[ValueProgress]) -> None:
+        rows = [Progress(at.step, at.loss, at.validation, math.nan, at.seconds) for at in history]
+        store(checkpoint(seed), state, rows)
 
     with progress(len(seeds) * numbers.iterations, "iterations") as show:
-        fits = fit_values(
+
+        def report(seed: int, at: ValueProgress) -> None:
+            show((seed - seeds.start) * numbers.iterations + at.step, f"cost and misfit {at.validation:.4g}")
+
+        return fit_values(
             problem,
             network,
             seeds,
             numbers=numbers,
             mesh=mesh,
             disturbance=disturbance,
-            report=lambda at: show(before + at.iteration, f"cost and misfit {at.validation:.4g}"),
-            restore=start,
+            report=report,
+            restore=stored,
             store=keep,
         )
-    return [
-        (fit.parameters, min(at.validation for at in fit.history), fit.train_seconds + fit.compile_seconds)
-        for fit in fits
-    ]
 
 
 def by_equation(
@@ -234,25 +230,24 @@ def by_equation(
     *,
     mesh: Mesh | None,
     disturbance: Disturbance | None,
-) -> list[tuple[Any, float, float]]:
+) -> list[ValueFit]:
     """Fits one value function per seed by the Hamilton-Jacobi-Bellman residual; devices of a mesh share the samples."""
     discounts, done = discounts_down_to(problem.discount), itertools.count(1)
-    trained = []
+
+    def fit(seed: int) -> ValueFit:
+        of_parameters, of_samples = jax.random.split(jax.random.key(seed))
+        return fit_hjb(
+            problem,
+            network.value_and_gradient,
+            network.init(of_parameters),
+            of_samples,
+            discounts=discounts,
+            iterations=iterations,
+            rounds=ROUNDS,
+            mesh=mesh,
+            disturbance=disturbance,
+            report=lambda at: show(next(done), f"discount {at.discount:.3g}/s, residual {at.validation:.2e}"),
+        )
+
     with progress(len(seeds) * (len(discounts) - 1 + ROUNDS), "iterations") as show:
-        for seed in seeds:
-            of_parameters, of_samples = jax.random.split(jax.random.key(seed))
-            began = time.perf_counter()
-            solution = fit_hjb(
-                problem,
-                network.value_and_gradient,
-                network.init(of_parameters),
-                of_samples,
-                discounts=discounts,
-                iterations=iterations,
-                rounds=ROUNDS,
-                mesh=mesh,
-                disturbance=disturbance,
-                report=lambda at: show(next(done), f"discount {at.discount:.3g}/s, residual {at.validation:.2e}"),
-            )
-            trained.append((solution.parameters, solution.validation, time.perf_counter() - began))
-    return trained
+        return [fit(seed) for seed in seeds]

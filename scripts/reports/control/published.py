@@ -23,9 +23,8 @@ from jaxtyping import Float
 from dln_jax.control.closed_loop import outcomes
 from dln_jax.control.optimal.action_costs import limited_atan
 from dln_jax.control.optimal.fitted import Iteration
-from dln_jax.control.optimal.flow import limits
 from dln_jax.control.optimal.own_plants import MARGIN
-from dln_jax.control.optimal.problem import ControlProblem, from_plant, rates
+from dln_jax.control.optimal.problem import ControlProblem, from_plant, limits, rates
 from dln_jax.control.state_space import Law, circular
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.closed_form import ClosedForm

@@ -15,13 +15,18 @@ import numpy as np
 from jax import Array
 
 from dln_jax.control.optimal.fitted import Iteration, fit_values
-from dln_jax.control.optimal.flow import flow
-from dln_jax.control.optimal.grid import extrapolated, lookahead, solve_on_grid
-from dln_jax.control.optimal.grid_interpolation import interpolated
-from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, circles, from_field, hjb_policy
+from dln_jax.control.optimal.grid import extrapolated, interpolated, lookahead, solve_on_grid
+from dln_jax.control.optimal.problem import (
+    ControlProblem,
+    ValueAndGradient,
+    circles,
+    flow,
+    from_field,
+    hjb_policy,
+    worst_disturbance,
+)
 from dln_jax.control.optimal.residual import fit_hjb
 from dln_jax.control.optimal.value_networks import value_network
-from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
 from dln_jax.control.regulators import lqr
 from dln_jax.control.shooting import shoot
 from dln_jax.control.state_space import Law
@@ -204,7 +209,7 @@ def equation(
     x, measured = starts(plant, "down", starts_down), {}
     network = value_network(plant.problem, widths=(width, width), scale=30.0)
     for name in ("trusting", "robust") if robust else ("",):
-        worst = worst_disturbance(rod, [1.0, 1.0], Bounds(parameters=0.15)) if name == "robust" else None
+        worst = worst_disturbance(rod, [1.0, 1.0], parameters=0.15) if name == "robust" else None
         effort: Any = {"samples": samples, "iterations": iterations, "disturbance": worst}
         effort |= {"rounds": 6} if robust else {}
         laws = []
