@@ -42,7 +42,7 @@ class Shooting(NamedTuple):
     end_multipliers: Float[Array, " q"]
     """Multipliers of the equations of the end."""
     pressures: Float[Array, " M"]
-    """Multipliers of the inequalities, not negative, in the order of `control.conditions`."""
+    """Multipliers of the inequalities, not negative, in the order of `control.constraints`."""
     defect: Float[Array, ""]
     """Largest |f(x_k, u_k) - x_{k+1}|, in the states' units."""
     violation: Float[Array, ""]
