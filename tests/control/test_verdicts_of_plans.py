@@ -54,6 +54,15 @@ def test_the_best_of_several_guesses_has_the_least_objective(method):
 STEPS = 4
 
 
+def test_single_shooting_is_tried_where_multiple_shooting_fails():
+    """The end has a root at -2.1, and its least violation nearby at 1, where the states of the guess are."""
+    problem = TrajectoryProblem(lambda x, u: x + u, lambda x, u: u @ u, FREE, end=lambda x: x**3 - 3 * x + 3)
+    guess = np.ones(1), np.ones((STEPS + 1, 1)), np.full((STEPS, 1), -0.75)
+    assert int(shoot(problem, *guess, method="multiple").ending) == Ending.INFEASIBLE
+    solution = shoot(problem, *guess)
+    assert solution.plan.x[-1, 0] < -2 and solution.verdict == "single shooting converged within the tolerance"
+
+
 def hill(price):
     """Steps to one of the wells at -1 and 1 cost price u²: the sum X of n equal ones has X² = 1 - price / 2 n."""
     return TrajectoryProblem(lambda x, u: x + u, lambda x, u: price * u @ u, lambda x: jnp.sum((x**2 - 1) ** 2), -5, 5)

@@ -7,7 +7,7 @@ import pytest
 
 from dln_jax.commands.values import plants
 from dln_jax.control.optimal.own_plants import FILES
-from dln_jax.control.optimal.problem import checked, rates
+from dln_jax.control.optimal.problem import rates
 from dln_jax.zoo.value_functions import plant_of_model
 from scripts.reports.control.published import PLANTS, evaluate, starts
 
@@ -44,17 +44,6 @@ def test_files_have_the_published_dynamics(name):
     published = PLANTS[name]()
     assert known.limits.control[0, 1] == published.limit
     np.testing.assert_allclose(rates(of_file)(x, u), rates(published.problem)(x, u), rtol=1e-9)
-
-
-@pytest.mark.parametrize("name", PLANTS)
-def test_plants_are_problems_in_both_precisions(name):
-    problem = PLANTS[name]().problem
-    if name == "cart-pole":
-        checked(problem)
-    with jax.enable_x64(False):
-        x = jnp.asarray(problem.goal, float)
-        rate, cost = jax.eval_shape(lambda x: (rates(problem)(x, jnp.zeros(1)), problem.state_cost(x)), x)
-        assert rate.dtype == jnp.float32 == cost.dtype
 
 
 def test_returns_of_rest_and_of_a_law_that_fails():
