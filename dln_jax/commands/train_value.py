@@ -5,9 +5,9 @@ and what the law costs from 100 starts near hanging and 100 anywhere, and writes
 value.json (dln_jax.load(folder).value), metrics.json, config.json, and figures of V and of the
 closed loop. --out FOLDER --resume continues an interrupted run.
 
---plant also takes an MJCF or URDF file, and --run the folder of a learned or identified model. Costs, box and times
-then come from the plant's natural scales and limits, and are printed. A law that does not bring its starts up is
-refused with exit status 1, unless your own --iterations ended the training.
+--plant takes the name of a desktop plant or an MJCF or URDF file, and --run the folder of a learned or identified
+model. Costs, box and times come from the plant's natural scales and limits, and are printed. A law that does not bring
+its starts up is refused with exit status 1, unless your own --iterations ended the training.
 """
 
 from collections.abc import Mapping
@@ -24,21 +24,21 @@ class TrainingOptions:
     """Plant, method and networks."""
 
     plant: Annotated[str, choice(("pendulum", "cart-pole", "rotary-pendulum", "FILE"))] = "pendulum"
-    """The plant and its costs. FILE is the path of an MJCF or URDF file."""
+    """A desktop plant (Lutter et al. 2021), or FILE, the path of an MJCF or URDF file."""
     run: Unstated[Path] = None
     """Folder of a learned or identified model that is the plant (default: --plant)."""
     actuated: Unstated[str] = None
-    """Own plant: joints with a motor, comma-separated names or numbers from 0 (default: the file's or the model's)."""
+    """Joints with a motor, comma-separated names or numbers from 0 (default: the file's or the model's)."""
     control: Unstated[str] = None
-    """Own plant: largest force of the motors, N m or N, one for all or one each (default: as stated in the file)."""
+    """Largest force of the motors, N m or N, one for all or one each (default: as stated in the file)."""
     positions: Unstated[str] = None
-    """Own plant: LOW:HIGH or free for each joint, rad or m, comma separated (default: the file's; of a model, free)."""
+    """LOW:HIGH or free for each joint, rad or m, comma separated (default: the file's; of a model, free)."""
     weights: Unstated[str] = None
-    """Own plant: weights of the squared deviations of coordinates and rates (default: by the plant's scales)."""
+    """Weights of the squared deviations of coordinates and rates (default: by the plant's scales)."""
     effort: Unstated[float] = None
-    """Own plant: cost of half the motors' limits over that of hanging (default: 0.25)."""
+    """Cost of half the motors' limits over that of hanging (default: 0.25)."""
     box: Unstated[str] = None
-    """Own plant: half widths of the box of coordinates and rates (default: by the plant's scales)."""
+    """Half widths of the box of coordinates and rates (default: by the plant's scales)."""
     robust: float = 0.0
     """Train against the worst errors of masses and motors up to this share."""
     method: Literal["fitted", "residual"] = "fitted"
@@ -52,7 +52,7 @@ class TrainingOptions:
     members: Unstated[int] = None
     """Number of networks, whose mean is V (default: 1)."""
     iterations: Unstated[int] = None
-    """Iterations of value iteration (default: 48 or 80 by the plant), or of Gauss-Newton per discount (15)."""
+    """Iterations of value iteration (default: 80), or of Gauss-Newton per discount (15)."""
     seed: int = 0
     """Seed of parameters and states."""
     seeds: int = 1

@@ -1,10 +1,10 @@
-"""Optimality conditions of a trajectory: constraints as one vector, derivatives by stage, residuals.
+"""Optimality conditions of a trajectory, and Newton steps of an interior-point method on them.
 
     L = sum_k l(x_k, u_k) + l_N(x_N) + sum_k λ_{k+1}·(f(x_k, u_k) - x_{k+1}) + z·c + ν·h(x_N),   c <= 0, h = 0
 
-c stacks limits of controls, path constraints, limits of states and constraints on states, first for the steps, then for
-the end. Limits and constraints of the first state are left out: no control changes them. The rows h and -h follow; they
-replace h = 0 where violations are minimised.
+The order of c is that of `control.constraints`. An inequality c - t + s = 0 has a slack s > 0 with multiplier z. A soft
+one also has an excess t > 0 with multiplier y, which costs w_1 t + w_2 t² / 2. The conditions s z = μ and t y = μ
+eliminate slacks and excesses, which leaves a quadratic program over the horizon.
 """
 
 from collections.abc import Callable
@@ -12,15 +12,15 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
-from jax.core import Tracer
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from dln_jax.control.riccati import Horizon
+from dln_jax.control.constraints import Kinds, kinds_of, rows_of, stacked
+from dln_jax.control.riccati import Horizon, HorizonSolution, least_cost
 from dln_jax.control.trajectories import TrajectoryProblem, knots_of
 
-Rows = Callable[..., Array]
+END_COMPLIANCE = 1e-8
+"""Compliance of the equations of the end in the linear systems; it does not change the solution."""
 
 
 class Values(NamedTuple):
@@ -28,7 +28,7 @@ class Values(NamedTuple):
 
     cost: Float[Array, ""]
     c: Float[Array, " M"]
-    """Inequalities, negative inside, then h and -h."""
+    """Inequalities, negative inside, in the order of `control.constraints`."""
     defects: Float[Array, "N n"]
     h: Float[Array, " q"]
     """Equations of the end."""
@@ -45,79 +45,6 @@ class Slopes(NamedTuple):
     h: Float[Array, "q n"]
 
 
-class Kinds(NamedTuple):
-    """Masks of the inequalities."""
-
-    present: Bool[Array, " M"]
-    """Finite limits and all constraints, except those on the first state."""
-    soft: Bool[Array, " M"]
-    unknowns: Bool[Array, " M"]
-    """Limits of the controls and of the free components of the states, such as a duration."""
-
-
-def _beyond(lower: Any, upper: Any) -> tuple[Rows, Callable[[int], Array]]:
-    """Returns y -> distances beyond the finite limits, and size of y -> mask of the finite ones."""
-
-    def sides(size: int) -> list[tuple[int, Any, np.ndarray]]:
-        chosen = []
-        for sign, limit in ((-1, lower), (1, upper)):
-            # Traced limits may turn out to be infinite; their rows are then masked.
-            traced = isinstance(limit, Tracer)
-            index = np.arange(size) if traced else np.flatnonzero(np.broadcast_to(np.isfinite(limit), size))
-            chosen.append((sign, jnp.broadcast_to(jnp.asarray(limit, float), size)[index], index))
-        return chosen
-
-    def rows(y: Array) -> Array:
-        finite = [(sign, jnp.where(jnp.isfinite(limit), limit, 0.0), i) for sign, limit, i in sides(len(y))]
-        return jnp.concatenate([sign * (y[index] - limit) for sign, limit, index in finite])
-
-    return rows, lambda size: jnp.concatenate([jnp.isfinite(limit) for _, limit, _ in sides(size)])
-
-
-def constraints(problem: TrajectoryProblem, n: int, m: int) -> tuple[Rows, Rows, Callable[[int], Kinds]]:
-    """Returns (x, u) -> rows [P] of a step, x -> rows [E] of the end, and N -> the masks of all M rows.
-
-    The rows of a step are limits of the controls, `path`, limits of the states and `states`.
-    """
-    of_u, finite_u = _beyond(problem.lower, problem.upper)
-    of_x, finite_x = _beyond(problem.lower_x, problem.upper_x)
-    _, last = knots_of(problem)
-
-    def on_state(x: Array, *knot: Any) -> list[Array]:
-        return [of_x(x), *([problem.states(x, *knot)] if problem.states else [])]
-
-    def step_rows(x: Array, u: Array, *knot: Any) -> Array:
-        path = [problem.path(x, u, *knot)] if problem.path else []
-        return jnp.concatenate([of_u(u), *path, *on_state(x, *knot)])
-
-    def end_rows(x: Array, *knot: Any) -> Array:
-        return jnp.concatenate([*on_state(x, *knot), *([problem.end_below(x, *knot)] if problem.end_below else [])])
-
-    def size(function: Any, *shapes: int) -> int:
-        return jax.eval_shape(function, *(jnp.zeros(shape) for shape in shapes), *last).shape[0] if function else 0
-
-    def kinds(steps: int) -> Kinds:
-        limits_u, limits_x = finite_u(m), finite_x(n)
-        free = jnp.zeros(n) if problem.free is None else jnp.asarray(problem.free, float)
-        # Rows that change with the free components.
-        free = jax.jvp(of_x, (jnp.zeros(n),), (free,))[1] != 0
-        path, states, end = size(problem.path, n, m), size(problem.states, n), size(problem.end_below, n)
-        yes, no = (lambda number: jnp.ones(number, bool)), (lambda number: jnp.zeros(number, bool))
-        u, x = len(limits_u), len(limits_x)
-
-        def every(of_step: list[Array], of_end: list[Array]) -> Array:
-            rows = jnp.tile(jnp.concatenate(of_step), (steps, 1)).at[0, u + path :].set(False)
-            return jnp.concatenate([rows.ravel(), *of_end])
-
-        return Kinds(
-            every([limits_u, yes(path), limits_x, yes(states)], [limits_x, yes(states + end)]),
-            every([no(u), yes(path), no(x), yes(states)], [no(x), yes(states + end)]),
-            every([yes(u), no(path), free, no(states)], [free, no(states + end)]),
-        )
-
-    return step_rows, end_rows, kinds
-
-
 class Conditions(NamedTuple):
     """Functions of a trajectory x [N+1, n], u [N, m], whose cost is multiplied by a scale."""
 
@@ -126,7 +53,6 @@ class Conditions(NamedTuple):
     curvatures: Callable[[Array, Array, Array, Array, Array], tuple[Array, Array]]
     """(x, u, prices, z, nu) -> Hessians of L for the steps [N, n+m, n+m] and the end [n, n]."""
     kinds: Kinds
-    """Masks of all rows except the last, h and -h."""
 
 
 def conditions(
@@ -137,7 +63,7 @@ def conditions(
     Unless `exact`, only costs have curvature (Gauss-Newton). `held` is one, or zero if the rows h and -h replace h = 0.
     """
     steps, n, m = shape
-    step_rows, below, kinds = constraints(problem, n, m)
+    step_rows, end_rows = (stacked(rows) for rows in rows_of(problem, n, m))
     end = problem.end if problem.end is not None else (lambda x, *knot: jnp.zeros(0, x.dtype))
     knots, last = knots_of(problem)
 
@@ -146,10 +72,6 @@ def conditions(
 
     def equal(x: Array, *knot: Any) -> Array:
         return held * end(x, *knot)
-
-    def end_rows(x: Array, *knot: Any) -> Array:
-        h = end(x, *knot)
-        return jnp.concatenate([below(x, *knot), h, -h])
 
     def cost(x: Array, u: Array, *knot: Any) -> Array:
         return scale * problem.cost(x, u, *knot)
@@ -161,7 +83,9 @@ def conditions(
         rows = jax.vmap(step_rows)(x[:-1], u, *knots)
         defects = jax.vmap(problem.step)(x[:-1], u, *knots) - x[1:]
         total = jnp.sum(jax.vmap(cost)(x[:-1], u, *knots)) + end_cost(x[-1])
-        return Values(total, jnp.concatenate([rows.ravel(), end_rows(x[-1], *last)]), defects, equal(x[-1], *last))
+        return Values(
+            total, jnp.concatenate([rows.ravel(), end_rows(x[-1], None, *last)]), defects, equal(x[-1], *last)
+        )
 
     def slopes(x: Array, u: Array) -> Slopes:
         both = jnp.concatenate([x[:-1], u], axis=1)
@@ -169,7 +93,7 @@ def conditions(
             jax.vmap(derivative(of_both(function)))(both, *knots)
             for derivative, function in ((jax.jacfwd, problem.step), (jax.grad, cost), (jax.jacfwd, step_rows))
         )
-        of_end = jax.grad(end_cost)(x[-1]), jax.jacfwd(end_rows)(x[-1], *last), jax.jacfwd(equal)(x[-1], *last)
+        of_end = jax.grad(end_cost)(x[-1]), jax.jacfwd(end_rows)(x[-1], None, *last), jax.jacfwd(equal)(x[-1], *last)
         return Slopes(steps, cost_slopes, of_end[0], rows, *of_end[1:])
 
     def of_stage(x: Array, u: Array, price: Array, z: Array, *knot: Any) -> Array:
@@ -178,15 +102,15 @@ def conditions(
         return cost(x, u, *knot) + price @ problem.step(x, u, *knot) + z @ step_rows(x, u, *knot)
 
     def of_end(x: Array, z: Array, nu: Array) -> Array:
-        return end_cost(x) + z @ end_rows(x, *last) + nu @ equal(x, *last) if exact else end_cost(x)
+        return end_cost(x) + z @ end_rows(x, None, *last) + nu @ equal(x, *last) if exact else end_cost(x)
 
     def curvatures(x: Array, u: Array, prices: Array, z: Array, nu: Array) -> tuple[Array, Array]:
         both, (by_step, at_end) = jnp.concatenate([x[:-1], u], axis=1), split(z, steps, end_size)
         of_steps = jax.vmap(jax.hessian(of_both(of_stage)))(both, prices, by_step, *knots)
         return of_steps, jax.hessian(of_end)(x[-1], at_end, nu)
 
-    end_size = jax.eval_shape(end_rows, jnp.zeros(n), *last).shape[0]
-    return Conditions(values, slopes, curvatures, kinds(steps))
+    end_size = jax.eval_shape(end_rows, jnp.zeros(n), None, *last).shape[0]
+    return Conditions(values, slopes, curvatures, kinds_of(problem, shape))
 
 
 def split(rows: Array, steps: int, end_size: int) -> tuple[Array, Array]:
@@ -227,3 +151,133 @@ def program(
         of_steps + damping * jnp.eye(of_steps.shape[1]), slopes.end_cost + slopes.end_rows.T @ at_end,
         of_end + damping * jnp.eye(n),
     )  # fmt: skip
+
+
+class Inequalities(NamedTuple):
+    """Masks [M] and weights of the inequalities."""
+
+    present: Array
+    elastic: Array
+    """Soft inequalities."""
+    strict: Array
+    """Limits of controls and durations, which no iterate may leave."""
+    linear: Any
+    square: Any
+
+
+class Iterate(NamedTuple):
+    """Unknowns and multipliers."""
+
+    x: Array
+    u: Array
+    prices: Array
+    """λ [N, n]."""
+    nu: Array
+    s: Array
+    z: Array
+    t: Array
+    y: Array
+
+
+class Residuals(NamedTuple):
+    """Largest absolute residuals of the optimality conditions."""
+
+    stationarity: Array
+    feasibility: Array
+    complementarity: Array
+
+    def largest(self) -> Array:
+        """Returns the largest of the three."""
+        return jnp.max(jnp.stack(self))
+
+
+def gaps(of: Inequalities, at: Iterate, values: Values) -> Array:
+    """Returns the residuals c - t + s of the inequalities."""
+    return jnp.where(of.present, values.c + at.s - at.t, 0.0)
+
+
+def measure(of: Inequalities, at: Iterate, values: Values, barrier: Array) -> tuple[Array, Array]:
+    """Returns the sum of the violations, and the barrier function, infinite if it is not a finite number."""
+    violation = jnp.sum(jnp.abs(jnp.concatenate([values.defects.ravel(), values.h, gaps(of, at, values)])))
+    price = of.linear * at.t + of.square * at.t**2 / 2 - barrier * jnp.log(at.t)
+    phi = values.cost - barrier * jnp.sum(jnp.where(of.present, jnp.log(at.s), 0.0))
+    phi = phi + jnp.sum(jnp.where(of.elastic, price, 0.0))
+    return violation, jnp.where(jnp.isfinite(phi), phi, jnp.inf)
+
+
+def slope(of: Inequalities, at: Iterate, slopes: Slopes, step: Iterate, barrier: Array) -> Array:
+    """Returns the derivative of the barrier function along a step."""
+    fall = along(slopes, step.x, step.u)[0] - barrier * jnp.sum(jnp.where(of.present, step.s / at.s, 0.0))
+    return fall + jnp.sum(jnp.where(of.elastic, (of.linear + of.square * at.t - barrier / at.t) * step.t, 0.0))
+
+
+def residuals(
+    of: Inequalities, at: Iterate, values: Values, slopes: Slopes, barrier: Any, free: Any
+) -> tuple[Residuals, Residuals]:
+    """Returns the residuals at a barrier, plain and divided by 1/100 of the mean multiplier if that is above one."""
+    gradient = stationarity(slopes, at.prices, at.z, at.nu, free)
+    products = jnp.where(of.present, at.s * at.z - barrier, 0.0)
+    gradient = jnp.append(gradient, jnp.where(of.elastic, of.linear + of.square * at.t - at.z - at.y, 0.0))
+    products = jnp.append(products, jnp.where(of.elastic, at.t * at.y - barrier, 0.0))
+    unmet = jnp.concatenate([values.defects.ravel(), values.h, gaps(of, at, values)])
+    plain = Residuals(*(jnp.max(jnp.abs(r), initial=0.0) for r in (gradient, unmet, products)))
+    of_rows, number = jnp.sum(at.z) + jnp.sum(at.y), jnp.maximum(jnp.sum(of.present), 1)
+    every = jnp.sum(jnp.abs(at.prices)) + jnp.sum(jnp.abs(at.nu)) + of_rows
+    scale = jnp.maximum(every / (at.prices.size + at.nu.size + number) / 100, 1.0)
+    scale_z = jnp.maximum(of_rows / number / 100, 1.0)
+    return plain, Residuals(plain[0] / scale, plain[1], plain[2] / scale_z)
+
+
+def newton(
+    of: Inequalities, at: Iterate, slopes: Slopes, curvatures: tuple[Array, Array], barrier: Array, unmet: Values,
+    gap: Array, damping: Array, free: Any,
+) -> tuple[HorizonSolution, Iterate]:  # fmt: skip
+    """Returns the Newton step, as a solution of the quadratic program and as a change of the iterate."""
+    stiff = at.z / at.s
+    drive = jnp.where(of.present, barrier / at.s, 0.0) - at.z + stiff * gap
+    give = jnp.where(of.elastic, 1 / (of.square + at.y / at.t), 0.0)
+    off = jnp.where(of.elastic, of.linear + of.square * at.t - at.z - barrier / at.t, 0.0)
+    drive, stiff = (drive + stiff * give * off) / (1 + stiff * give), stiff / (1 + stiff * give)
+    horizon = program(slopes, curvatures, at.z + drive, stiff, unmet.defects, damping)
+    horizon = horizon._replace(
+        end_gradient=horizon.end_gradient + slopes.h.T @ (at.nu + unmet.h / END_COMPLIANCE),
+        end_curvature=horizon.end_curvature + slopes.h.T @ slopes.h / END_COMPLIANCE,
+    )
+    change = least_cost(horizon, free)
+    _, of_c, of_h = along(slopes, change.dx, change.du)
+    dz = drive + stiff * of_c
+    dt = give * (dz - off)
+    dy = jnp.where(of.elastic, (barrier - at.y * dt) / at.t - at.y, 0.0)
+    prices, nu = change.multipliers - at.prices, (unmet.h + of_h) / END_COMPLIANCE
+    return change, Iterate(change.dx, change.du, prices, nu, dt - gap - of_c, dz, dt, dy)
+
+
+def to_boundary(of: Inequalities, at: Iterate, step: Iterate, share: Array) -> tuple[Array, Array]:
+    """Returns the longest step lengths, at most one, that use up at most `share` of s and t, and of z and y."""
+
+    def longest(*pairs: tuple[Array, Array, Array]) -> Array:
+        fastest = [jnp.max(jnp.where(mask, -d / v, 0.0), initial=0.0) for v, d, mask in pairs]
+        return jnp.minimum(1.0, share / jnp.maximum(jnp.max(jnp.stack(fastest)), 1e-30))
+
+    return (
+        longest((at.s, step.s, of.present), (at.t, step.t, of.elastic)),
+        longest((at.z, step.z, of.present), (at.y, step.y, of.elastic)),
+    )
+
+
+def inside(of: Inequalities, values: Values, x: Array, u: Array, margin: float) -> Iterate:
+    """Returns the first iterate: slacks of at least a margin unless strict, z = 1, y >= 1, other multipliers zero."""
+    t = jnp.where(of.elastic, jnp.maximum(values.c, 0.0) + margin, 0.0)
+    slack = jnp.where(of.strict & (values.c < 0), -values.c, jnp.maximum(t - values.c, margin))
+    s, z = jnp.where(of.present, slack, 1.0), jnp.where(of.present, 1.0, 0.0)
+    y = jnp.where(of.elastic, jnp.maximum(of.linear + of.square * t - z, 1.0), 0.0)
+    return Iterate(x, u, jnp.zeros_like(values.defects), jnp.zeros_like(values.h), s, z, t, y)
+
+
+def guarded(of: Inequalities, at: Iterate, barrier: Array, spread: float) -> Iterate:
+    """Limits z and y so that s z and t y stay within the factor `spread` of the barrier."""
+
+    def within(z: Array, s: Array, mask: Array) -> Array:
+        return jnp.where(mask, jnp.clip(z, barrier / (spread * s), spread * barrier / s), 0.0)
+
+    return at._replace(z=within(at.z, at.s, of.present), y=within(at.y, at.t, of.elastic))

@@ -1,4 +1,4 @@
-"""The interior-point method of `shoot` and `optimise`.
+"""The interior-point method of `shoot`.
 
 Riccati's recursion solves Newton steps on the optimality conditions while the barrier μ falls to zero (Fiacco and
 McCormick 1968). As in IPOPT (Wächter and Biegler 2006, with its constants), a filter of violation and barrier function
@@ -19,10 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control.barrier import (
+from dln_jax.control.conditions import (
+    Conditions,
     Inequalities,
     Iterate,
     Residuals,
+    Values,
     gaps,
     guarded,
     inside,
@@ -32,7 +34,6 @@ from dln_jax.control.barrier import (
     slope,
     to_boundary,
 )
-from dln_jax.control.conditions import Conditions, Values
 from dln_jax.control.riccati import HorizonSolution
 from dln_jax.solvers.ending import Ending
 
@@ -84,11 +85,6 @@ class Search(NamedTuple):
 
 Trial = Callable[[Iterate, HorizonSolution, Array], tuple[Array, Array]]
 """(iterate, change, length) -> x, u."""
-
-
-def straight(at: Iterate, change: HorizonSolution, length: Array) -> tuple[Array, Array]:
-    """Returns the trial of multiple shooting: states and controls move along the change."""
-    return at.x + length * change.dx, at.u + length * change.du
 
 
 def search(

@@ -1,4 +1,4 @@
-"""The phases of `shoot` and `optimise`: searches for a minimum, escapes from saddles, and restoration.
+"""The phases of `shoot`: searches for a minimum, escapes from saddles, and restoration.
 
 If a search ends at a saddle, the next one starts beside it, along a direction of negative curvature of the Lagrangian.
 If a search gives up where hard constraints are violated, the next one minimises the sum of violations of all hard
@@ -14,8 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from dln_jax.control.barrier import Inequalities
-from dln_jax.control.conditions import Conditions, Kinds
+from dln_jax.control.conditions import Conditions, Inequalities
 from dln_jax.control.interior_point import Search, Trial, search, started
 from dln_jax.solvers.ending import Ending
 
@@ -54,14 +53,14 @@ def phases(
     `of` takes the weight of the cost, and one, or zero if rows replace the equations of the end. Returns the last
     search and the weight of its cost.
     """
-    kinds, ends = _with_ends(of(jnp.ones(()), jnp.ones(())), x, u)
+    kinds = of(jnp.ones(()), jnp.ones(())).kinds
     limited = kinds.soft & (soft is not None)
     hard = kinds.present & ~limited
-    prices = jnp.where(kinds.soft | ends, 1.0, PRICE), 0.0
+    prices = jnp.where(kinds.soft | kinds.ends, 1.0, PRICE), 0.0
 
     def prepared(restoring: Array) -> tuple[Array, Conditions, Inequalities]:
         weight = jnp.where(restoring, RESTORING, 1.0)
-        present = kinds.present & (restoring | ~ends)
+        present = kinds.present & (restoring | ~kinds.ends)
         elastic = present & jnp.where(restoring, ~kinds.unknowns, limited)
         weights = (jnp.where(limited, weight * w, price) for w, price in zip(soft or (0.0, 0.0), prices, strict=True))
         rows = Inequalities(present, elastic, kinds.unknowns, *weights)
@@ -106,11 +105,3 @@ def phases(
 def gave_up(ending: Array) -> Array:
     """Returns whether a search ended without a verdict on its point."""
     return (ending == Ending.NO_DESCENT) | (ending == Ending.OUT_OF_ITERATIONS)
-
-
-def _with_ends(of: Conditions, x: Array, u: Array) -> tuple[Kinds, Array]:
-    """Returns the masks of all rows, including those that replace the equations of the end, and the mask of these."""
-    number = len(jax.eval_shape(of.values, x, u).c)
-    ends = jnp.arange(number) >= len(of.kinds.present)
-    kinds = Kinds(*(jnp.append(mask, jnp.zeros(number - len(mask), bool)) for mask in of.kinds))
-    return kinds._replace(present=kinds.present | ends), ends

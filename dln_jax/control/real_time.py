@@ -107,7 +107,7 @@ def mpc(
 ) -> Callable[..., tuple[Array, Plan]]:
     """Model predictive control: (state, plan) -> (control, plan of the next sample), by `feedback`, then `prepare`.
 
-    Start with a plan of `optimise`, `shoot` or `first_plan`, after a few calls of `improve`. If the problem has knots,
+    Start with a plan of `shoot` or `first_plan`, after a few calls of `improve`. If the problem has knots,
     pass them as a third argument, N+2 rows from the present sample on.
 
     Args:
@@ -135,7 +135,7 @@ def improve(
 
     Args:
         problem: over the horizon.
-        plan: such as a result of `optimise`, `shoot` or `first_plan`.
+        plan: such as a result of `shoot` or `first_plan`.
         barrier: μ, in units of the cost; it may be traced, to fall from iteration to iteration.
         step_lengths: step lengths [L] that an iteration tries.
 

@@ -2,15 +2,14 @@
 
     min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   c <= 0,   h(x_N) = 0
 
-`shoot` takes the states at all knots as unknowns. The defect of a step, f(x_k, u_k) - x_{k+1}, vanishes only at the
-solution: a guess need not be a motion, and an unstable system does not multiply its errors over the horizon (Bock and
-Plitt 1984). `optimise` moves the controls alone: each trial is a motion under the gains of the step. Both use the full
-curvature, including that of the steps. Implicit steps made by `integrated` are differentiated by the implicit function
-theorem.
+Multiple shooting takes the states at all knots as unknowns. The defect of a step, f(x_k, u_k) - x_{k+1}, vanishes only
+at the solution: a guess need not be a motion, and an unstable system does not multiply its errors over the horizon
+(Bock and Plitt 1984). Single shooting moves the controls alone: each trial is a motion under the gains of the step, so
+it cannot get stuck between states that no motion joins. Both use the full curvature, including that of the steps.
+Implicit steps made by `integrated` are differentiated by the implicit function theorem.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +18,12 @@ from jax import Array
 from jax.core import Tracer
 from jaxtyping import Bool, Float, Int
 
-from dln_jax.control.barrier import Iterate
-from dln_jax.control.conditions import Conditions, conditions
-from dln_jax.control.contradictions import require_end, require_start
-from dln_jax.control.interior_point import Search, straight
+from dln_jax.control.conditions import Conditions, Iterate, conditions
+from dln_jax.control.constraints import require_end, require_start
 from dln_jax.control.phases import gave_up, phases
 from dln_jax.control.riccati import HorizonSolution
 from dln_jax.control.trajectories import FIRST_DAMPING, Plan, TrajectoryProblem, first_plan, followed, knots_of
-from dln_jax.solvers.ending import Ending
+from dln_jax.solvers.ending import Ending, reason
 from dln_jax.types import InputError, require_positive
 
 HELD = 100.0
@@ -36,7 +33,7 @@ LARGEST_GRADIENT = 100.0
 
 
 class Shooting(NamedTuple):
-    """Result of multiple shooting."""
+    """Result of `shoot`."""
 
     plan: Plan
     """Plan for `mpc` and for feedback along it; its states are those at the knots, a motion to within the defect."""
@@ -45,7 +42,7 @@ class Shooting(NamedTuple):
     end_multipliers: Float[Array, " q"]
     """Multipliers of the equations of the end."""
     pressures: Float[Array, " M"]
-    """Multipliers of the inequalities, not negative, in the order of `control.conditions`."""
+    """Multipliers of the inequalities, not negative, in the order of `control.constraints`."""
     defect: Float[Array, ""]
     """Largest |f(x_k, u_k) - x_{k+1}|, in the states' units."""
     violation: Float[Array, ""]
@@ -63,14 +60,21 @@ class Shooting(NamedTuple):
     iterations: Int[Array, ""]
     ending: Int[Array, ""]
     """An `Ending`."""
+    single: Bool[Array, ""]
+    """Whether the plan is that of single shooting."""
 
     @property
     def converged(self) -> Bool[Array, ""]:
         """Whether all conditions of an optimum hold within the tolerance, and all constraints within 100 times it.
 
-        `solvers.ending.reason` says why not.
+        `verdict` says why not.
         """
         return self.ending == Ending.CONVERGED
+
+    @property
+    def verdict(self) -> str:
+        """Which method gave the plan, and how its search ended."""
+        return f"{'single' if self.single else 'multiple'} shooting {reason(self.ending)}"
 
 
 def shoot(
@@ -79,12 +83,13 @@ def shoot(
     states: Any,
     u: Any,
     *,
+    method: Literal["multiple", "single"] | None = None,
     iterations: int = 300,
     tolerance: float = 1e-8,
     exact: bool = True,
     starts: tuple[Any, Any] | None = None,
 ) -> Shooting:
-    """Returns a locally optimal trajectory near a guess, by multiple shooting; traceable.
+    """Returns a locally optimal trajectory near a guess; traceable.
 
     The search leaves saddles. If it gives up where hard constraints are violated, another search restores them or shows
     that the problem is locally infeasible (see `control.phases`). The plan of `Ending.INFEASIBLE` has the least
@@ -94,7 +99,10 @@ def shoot(
         problem: problem to solve.
         x: initial state [n].
         states: guess [N+1, n], which need not be a motion; x replaces its first state, except for free components.
+            `None` for the motion under u, with which single shooting starts in any case.
         u: guess [N, m].
+        method: by default multiple shooting, and single shooting from the same controls if that fails. The plan is then
+            that of single shooting if it converged.
         iterations: largest number of iterations of a search; leaving a saddle and restoring constraints are separate
             searches.
         tolerance: tolerance of stationarity, feasibility and complementarity, with the cost scaled so that its
@@ -102,85 +110,69 @@ def shoot(
             mean multiplier if that is above one.
         exact: whether to use the curvature of the steps and constraints; otherwise the method is Gauss-Newton, which
             does not recognise saddles.
-        starts: more guesses, states [G, N+1, n] and u [G, N, m]. All run as one program, and the best is kept: that of
-            least objective within the hard constraints, or else of least violation.
+        starts: more guesses, states [G, N+1, n] or `None`, and u [G, N, m]. All run as one program, and the best is
+            kept: that of least objective within the hard constraints, or else of least violation.
 
     Raises:
         InputError: shapes do not agree, a setting is not positive, limits are crossed, the start violates the limits of
             the states or their constraints, or these limits exclude a linear constraint of the end.
     """
-    if starts is not None:
+    require_positive(iterations=iterations, tolerance=tolerance)
+    if method not in (None, "multiple", "single"):
+        raise InputError(f"method is {method!r}; expected 'multiple', 'single', or None for one after the other")
+    start, x, u = x, jnp.asarray(x, float), jnp.asarray(u, float)
+    states = None if states is None or method == "single" else jnp.asarray(states, float)
+    if x.ndim != 1 or u.ndim != 2 or not len(u) or (states is not None and states.shape != (len(u) + 1, len(x))):
+        shape = None if states is None else states.shape
+        raise InputError(f"x has shape {x.shape}, states {shape}, u {u.shape}; expected [n], [N+1, n] and [N, m]")
+    require_start(problem, start, u.shape[1])
+    require_end(problem, len(x), u.shape[1])
+    free = jnp.zeros(len(x), bool) if problem.free is None else jnp.asarray(problem.free)
+    guesses = (states, u) if starts is None else _with_first(states, u, *starts)
 
-        def one(states: Array, u: Array) -> Shooting:
-            return shoot(problem, x, states, u, iterations=iterations, tolerance=tolerance, exact=exact)
+    def one(single: Any, states: Any, u: Array) -> Shooting:
+        u = _inside(u, problem.lower, problem.upper, "controls")
+        knots = None
+        if states is not None:
+            knots = _inside(states, problem.lower_x, problem.upper_x, "states")
+            knots = knots.at[0].set(jnp.where(free, knots[0], x))
+        if knots is None or method is None:
+            motion = first_plan(problem, x, u).x
+            knots = motion if knots is None else jnp.where(single, motion, knots)
+        return _solved(problem, knots, u, single, method, (iterations, tolerance, exact))
 
-        return _best(jax.vmap(one)(*_with_first((states, u), starts)))
-    start = x
-    x, states, u = (jnp.asarray(array, float) for array in (x, states, u))
-    if x.ndim != 1 or u.ndim != 2 or not len(u) or states.shape != (len(u) + 1, x.shape[0]):
-        raise InputError(
-            f"x has shape {x.shape}, states {states.shape}, u {u.shape}; expected [n], [N+1, n] and [N, m]"
-        )
-    require_start(problem, start)
-    inside = _inside(states, problem.lower_x, problem.upper_x, "states")
-    first = x if problem.free is None else jnp.where(jnp.asarray(problem.free), inside[0], x)
-    u = _inside(u, problem.lower, problem.upper, "controls")
-    return _solved(problem, inside.at[0].set(first), u, straight, iterations, tolerance, exact)
+    def best(single: Any) -> Shooting:
+        if starts is None:
+            return one(single, *guesses)
+        plans = jax.vmap(lambda *guess: one(single, *guess))(*guesses)
+        # Least objective, or least violation if all violate hard constraints.
+        keys = plans.objective, jnp.maximum(plans.violation, plans.feasibility)
+        objective, off = (jnp.where(jnp.isfinite(key), key, jnp.inf) for key in keys)
+        chosen = jnp.where(jnp.isfinite(objective).any(), jnp.argmin(objective), jnp.argmin(off))
+        return jax.tree.map(lambda leaf: leaf[chosen], plans)
 
+    if method is not None:
+        return best(jnp.asarray(method == "single"))
+    best = jax.jit(best)  # traced once, for its shapes and for both attempts
 
-def optimise(
-    problem: TrajectoryProblem,
-    x: Any,
-    u: Any,
-    *,
-    iterations: int = 300,
-    tolerance: float = 1e-8,
-    exact: bool = True,
-    starts: Any = None,
-) -> Plan:
-    """Returns a locally optimal plan from initial controls, by single shooting; traceable.
+    def failed(plan: Shooting) -> Array:
+        return (plan.ending != Ending.CONVERGED) & (plan.ending != Ending.EXCEEDED)
 
-    The plan's `ending` states why the search ended; if it converged, all conditions of an optimum hold within the
-    tolerance.
+    def attempt(state: tuple[Array, Shooting]) -> tuple[Array, Shooting]:
+        number, before = state
+        plan = best(number == 1)
+        replaced = (number == 0) | ~failed(plan)
+        return number + 1, jax.tree.map(lambda new, old: jnp.where(replaced, new, old), plan, before)
 
-    Args:
-        problem: problem to solve.
-        x: initial state [n].
-        u: initial controls [N, m].
-        iterations: as for `shoot`.
-        tolerance: as for `shoot`.
-        exact: as for `shoot`.
-        starts: more guesses [G, N, m], as for `shoot`.
-
-    Raises:
-        InputError: as for `shoot`.
-    """
-    plan = _single(problem, x, u, iterations, tolerance, exact) if starts is None else _best(
-        jax.vmap(lambda u: _single(problem, x, u, iterations, tolerance, exact))(*_with_first((u,), (starts,)))
-    )  # fmt: skip
-    return plan.plan._replace(u=jnp.clip(plan.plan.u, problem.lower, problem.upper))
-
-
-def _single(problem: TrajectoryProblem, x: Any, u: Any, iterations: int, tolerance: float, exact: bool) -> Shooting:
-    u = _inside(jnp.asarray(u, float), problem.lower, problem.upper, "controls")
-    plan = first_plan(problem, x, u)
-    require_start(problem, x)
-
-    def motion(at: Iterate, change: HorizonSolution, length: Array) -> tuple[Array, Array]:
-        """Returns the motion under the gains of the step."""
-        k = length * (change.du - jnp.einsum("kij,kj->ki", change.K, change.dx[:-1]))
-        first = at.x[0] + length * change.dx[0]
-        return followed(problem, first, (at.x[:-1], at.u, k, change.K), lambda u, _: u)
-
-    return _solved(problem, plan.x, plan.u, motion, iterations, tolerance, exact)
+    none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(best, jnp.asarray(False)))
+    none = none._replace(ending=jnp.asarray(Ending.UNDECIDED))
+    return jax.lax.while_loop(lambda state: (state[0] < 2) & failed(state[1]), attempt, (jnp.asarray(0), none))[1]
 
 
 def _solved(
-    problem: TrajectoryProblem, x: Array, u: Array, trial: Callable[..., Any], iterations: int, tolerance: float,
-    exact: bool,
-) -> Shooting:  # fmt: skip
-    require_positive(iterations=iterations, tolerance=tolerance)
-    require_end(problem, x.shape[1])
+    problem: TrajectoryProblem, x: Array, u: Array, single: Any, method: Any, settings: tuple[int, float, bool]
+) -> Shooting:
+    iterations, tolerance, exact = settings
     shape, (knots, last_knot) = (len(u), x.shape[1], u.shape[1]), knots_of(problem)
 
     def cost(x: Array, u: Array) -> Array:
@@ -193,50 +185,63 @@ def _solved(
     def of(weight: Array, held: Array) -> Conditions:
         return conditions(problem, shape, weight / scale, exact, held)
 
-    soft = None if problem.soft is None else (problem.soft[0] / scale, problem.soft[1] / scale)
+    def straight(at: Iterate, change: HorizonSolution, length: Array) -> tuple[Array, Array]:
+        """Moves states and controls along the change."""
+        return at.x + length * change.dx, at.u + length * change.du
+
+    def motion(at: Iterate, change: HorizonSolution, length: Array) -> tuple[Array, Array]:
+        """Returns the motion under the gains of the step."""
+        k = length * (change.du - jnp.einsum("kij,kj->ki", change.K, change.dx[:-1]))
+        first = at.x[0] + length * change.dx[0]
+        return followed(problem, first, (at.x[:-1], at.u, k, change.K), lambda u, _: u)
+
+    def either(*arguments: Any) -> tuple[Array, Array]:
+        return jax.lax.cond(single, motion, straight, *arguments)
+
+    trial = {"multiple": straight, "single": motion, None: either}[method]
+    w_1, w_2 = problem.soft or (0.0, 0.0)
+    soft = None if problem.soft is None else (w_1 / scale, w_2 / scale)
     last, weight = phases(of, trial, x, u, soft=soft, free=problem.free, iterations=iterations, tolerance=tolerance)
-    return _result(of(jnp.ones(()), jnp.ones(())), last, scale / weight, tolerance, problem.soft, weight == 1)
 
-
-def _result(
-    of: Conditions, last: Search, scale: Array, tolerance: float, soft: Any, not_restored: Array
-) -> Shooting:  # fmt: skip
-    at, values, residuals = last.at, last.values, last.residuals
-    present = of.kinds.present
-    rows, (above, below) = len(present), jnp.split(at.z[len(present) :], 2)
-    excess = jnp.where(present, jnp.maximum(values.c[:rows], 0.0), 0.0)
-    violation = jnp.maximum(jnp.max(excess, initial=0.0), jnp.max(values.c[rows:], initial=0.0))
+    at, values, residuals, kinds = last.at, last.values, last.residuals, of(jnp.ones(()), jnp.ones(())).kinds
+    ended = jnp.split(at.z[len(at.z) - 2 * len(at.nu) :], 2)
+    pressures = at.z[: len(at.z) - 2 * len(at.nu)]
+    excess = jnp.where(kinds.present, jnp.maximum(values.c, 0.0), 0.0)
+    violation = jnp.max(excess, initial=0.0)
     outside = gave_up(last.ending) & (residuals.feasibility > jnp.sqrt(tolerance))
     exceeded = (last.ending == Ending.CONVERGED) & (violation > HELD * tolerance)
     ending = jnp.select([outside, exceeded], [Ending.VIOLATED, Ending.EXCEEDED], last.ending)
-    damping, cost = jnp.asarray(FIRST_DAMPING, at.u.dtype), scale * values.cost
-    w_1, w_2 = soft or (0.0, 0.0)
-    objective = cost + jnp.sum(jnp.where(of.kinds.soft, w_1 * excess + w_2 / 2 * excess**2, 0.0))
+    scale = scale / weight
+    objective = scale * values.cost + jnp.sum(jnp.where(kinds.soft, w_1 * excess + w_2 / 2 * excess**2, 0.0))
     # After a search that minimised violations, feasibility does not count them.
-    held = not_restored & (residuals.feasibility <= HELD * tolerance)
-    plan = Plan(at.u, at.x, last.change.K, cost, damping, jnp.asarray(True), ending)
+    held = (weight == 1) & (residuals.feasibility <= HELD * tolerance)
+    damping = jnp.asarray(FIRST_DAMPING, at.u.dtype)
     return Shooting(
-        plan, scale * at.prices, scale * (at.nu + above - below), scale * at.z[:rows],
-        jnp.max(jnp.abs(values.defects)), violation, jnp.where(held, objective, jnp.inf), *residuals,
-        scale, last.iterations, ending,
-    )  # fmt: skip
+        Plan(at.u, at.x, last.change.K, scale * values.cost, damping, jnp.asarray(True), ending),
+        scale * at.prices,
+        scale * (at.nu + ended[0] - ended[1]),
+        scale * pressures,
+        jnp.max(jnp.abs(values.defects)),
+        violation,
+        jnp.where(held, objective, jnp.inf),
+        *residuals,
+        scale,
+        last.iterations,
+        ending,
+        jnp.asarray(single),
+    )
 
 
-def _with_first(first: tuple[Any, ...], more: tuple[Any, ...]) -> list[Array]:
-    """Stacks a guess and further guesses."""
-    pairs = [(jnp.asarray(one, float), jnp.asarray(others, float)) for one, others in zip(first, more, strict=True)]
-    if any(others.shape[1:] != one.shape for one, others in pairs):
-        shapes = [others.shape for _, others in pairs]
-        raise InputError(f"starts have shapes {shapes}; expected the shape of the guess behind an axis of guesses")
-    return [jnp.concatenate([one[None], others]) for one, others in pairs]
+def _with_first(states: Any, u: Array, more_states: Any, more_u: Any) -> tuple[Any, Array]:
+    """Stacks a guess and further guesses; without states, those of the others do not count."""
 
+    def both(one: Array, others: Any) -> Array:
+        others = jnp.asarray(others, float)
+        if others.shape[1:] != one.shape:
+            raise InputError(f"starts have shape {others.shape}; expected {one.shape} behind an axis of guesses")
+        return jnp.concatenate([one[None], others])
 
-def _best(solutions: Shooting) -> Shooting:
-    """Returns the solution of least objective, or that of least violation if all violate hard constraints."""
-    keys = solutions.objective, jnp.maximum(solutions.violation, solutions.feasibility)
-    objective, off = (jnp.where(jnp.isfinite(key), key, jnp.inf) for key in keys)
-    best = jnp.where(jnp.isfinite(objective).any(), jnp.argmin(objective), jnp.argmin(off))
-    return jax.tree.map(lambda leaf: leaf[best], solutions)
+    return None if states is None else both(states, more_states), both(u, more_u)
 
 
 def _inside(guess: Array, lower: Any, upper: Any, name: str) -> Array:

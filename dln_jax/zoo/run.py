@@ -201,10 +201,6 @@ def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, tr
             catalogue is neither passed nor trusted; or the model needs double precision (the message names the line).
     """
     directory = Path(directory)
-    if not is_file(directory / f"{MODEL}.json") and (value := _value_in(directory)) is not None:
-        wide = jax.tree.leaves(value.parameters)[0].dtype == jnp.float64
-        description = {"name": "value-function", "precision": "f64" if wide else "f32"}
-        return Run(value.network, value.parameters, description, value_function=value)  # type: ignore[arg-type]
     description = read_description(directory)
     if description.get("precision") == "f64":
         require_double_precision(str(directory))
@@ -218,8 +214,8 @@ def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, tr
     return Run(model, parameters, description, load_uncertainty(directory), _value_in(directory, model, parameters))
 
 
-def _value_in(directory: Path, model: Any = None, parameters: Parameters = None) -> "ValueRun | None":
-    """The value function in a folder, if there is one, of a published plant or of the folder's model."""
+def _value_in(directory: Path, model: Any, parameters: Parameters) -> "ValueRun | None":
+    """The value function in a folder of a model, if there is one."""
     if not is_file(directory / f"{VALUE}.json"):
         return None
     from dln_jax.zoo.value_functions import load_value  # other runs do not need optimal control

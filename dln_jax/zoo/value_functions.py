@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -13,8 +13,7 @@ import numpy as np
 from jax import Array
 
 from dln_jax.control.optimal.own_plants import OwnProblem, own_plant
-from dln_jax.control.optimal.plants import PLANTS, ValuePlant
-from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, at_goal, hjb_policy
+from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, hjb_policy
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
 from dln_jax.control.state_space import Law
 from dln_jax.files import as_type
@@ -24,7 +23,6 @@ from dln_jax.nn.activations import activation
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import REMEDY, VALUE, load_manifest, load_tree, save_tree
 
-OTHER_NAMES = {"furuta": "rotary-pendulum", "cartpole": "cart-pole"}
 SETTINGS = {"widths": tuple[int, ...], "members": int, "activation": str, "floor": float, "scale": float}
 """Arguments of `value_network` that value.json states."""
 
@@ -34,17 +32,13 @@ class ValueRun:
     """A value function with its plant."""
 
     name: str
-    """Name of the plant."""
-    plant: ValuePlant
+    """Name of the plant, or the file or folder that it is from."""
+    problem: ControlProblem
+    """The control problem: dynamics and cost."""
+    own: OwnProblem
+    """The numbers of the problem."""
     network: ValueNetwork
     parameters: Any
-    own: OwnProblem | None = None
-    """Problem of a user's own plant."""
-
-    @property
-    def problem(self) -> ControlProblem:
-        """The control problem: dynamics and cost."""
-        return self.plant.problem
 
     @functools.cached_property
     def value_and_gradient(self) -> ValueAndGradient:
@@ -57,26 +51,8 @@ class ValueRun:
         return jax.jit(hjb_policy(self.value_and_gradient, self.problem))
 
 
-def plant_named(name: str, goal: Sequence[float] | None = None) -> ValuePlant:
-    """The plant with this name, with a posture [d] other than upright as its goal, if requested.
-
-    Raises:
-        InputError: an unknown name (the message lists all), or a goal of the wrong length or that no control can hold.
-    """
-    name = OTHER_NAMES.get(name, name)
-    if name not in PLANTS:
-        raise InputError(f"plant '{name}' is unknown; choose from {', '.join(PLANTS)}, or give the path of a file")
-    plant = PLANTS[name]()
-    if goal is None:
-        return plant
-    d = len(plant.problem.goal) // 2
-    if len(goal) != d:
-        raise InputError(f"the goal has {len(goal)} coordinates; expected the posture of {name}, which has {d}")
-    return plant._replace(problem=at_goal(plant.problem, [*goal, *np.zeros(d)]))
-
-
-def plant_of_model(model: Any, parameters: Parameters, problem: OwnProblem) -> ValuePlant:
-    """The plant of a learned or identified `Model` of joints."""
+def plant_of_model(model: Any, parameters: Parameters, problem: OwnProblem) -> ControlProblem:
+    """The control problem of a learned or identified `Model` of joints."""
     # Value iteration in float32 reads NumPy's float64 as float32, but not JAX's.
     energies = model.energies(jax.tree.map(np.asarray, parameters))
     return own_plant(equations.dynamics(energies, degrees_of_freedom=len(problem.joints)), problem)
@@ -87,27 +63,19 @@ def network_of(problem: ControlProblem, settings: Mapping[str, Any]) -> ValueNet
     return value_network(problem, **{**settings, "activation": activation(settings["activation"])})
 
 
-def save_value(
-    folder: Path,
-    plant: str,
-    goal: Sequence[float] | None,
-    settings: Mapping[str, Any],
-    parameters: Any,
-    own: OwnProblem | None = None,
-) -> None:
-    """Writes value.json and value.safetensors; the model of a user's own plant is saved by `zoo.run.save`."""
+def save_value(folder: Path, plant: str, settings: Mapping[str, Any], parameters: Any, own: OwnProblem) -> None:
+    """Writes value.json and value.safetensors; the model of the plant is saved by `zoo.run.save`."""
     facts = {
         "plant": plant,
-        "goal": goal,
         "network": settings,
         "dtype": str(jax.tree.leaves(parameters)[0].dtype),
-        "own": None if own is None else dataclasses.asdict(own),
+        "own": dataclasses.asdict(own),
     }
     save_tree(folder, VALUE, parameters, facts)
 
 
-def load_value(folder: Path, model: Any = None, parameters: Parameters = None) -> ValueRun:
-    """The value function in a folder; a user's own plant needs the model that is stored with it.
+def load_value(folder: Path, model: Any, parameters: Parameters) -> ValueRun:
+    """The value function in a folder, of the model of a plant that is stored with it.
 
     Raises:
         InputError: there is none, or its files are damaged or of another release.
@@ -117,14 +85,12 @@ def load_value(folder: Path, model: Any = None, parameters: Parameters = None) -
     def stated(key: str, kind: Any, facts: Mapping[str, Any] = manifest) -> Any:
         return as_type(facts.get(key), kind, name=f"{path}: {key}", remedy=REMEDY)
 
-    name, goal, own = stated("plant", str), stated("goal", tuple[float, ...] | None), stated("own", OwnProblem | None)
+    name, own = stated("plant", str), stated("own", OwnProblem)
     dtype, facts = jnp.dtype(stated("dtype", Literal["float32", "float64"])), stated("network", dict[str, Any])
     settings = {key: stated(key, kind, facts) for key, kind in SETTINGS.items()}
-    if own is not None and model is None:
-        raise InputError(f"{path}: the model of the plant is missing; {REMEDY}")
     try:
-        plant = plant_named(name, goal) if model is None or own is None else plant_of_model(model, parameters, own)
-        network = network_of(plant.problem, settings)
+        problem = plant_of_model(model, parameters, own)
+        network = network_of(problem, settings)
     except InputError as error:
         raise InputError(f"{path}: {error}; {REMEDY}") from None
 
@@ -132,4 +98,4 @@ def load_value(folder: Path, model: Any = None, parameters: Parameters = None) -
         return jax.tree.map(lambda leaf: leaf.astype(dtype), network.init(key))
 
     stored = load_tree(folder, VALUE, jax.eval_shape(like, jax.random.key(0)))
-    return ValueRun(name, plant, network, stored, own)
+    return ValueRun(name, problem, own, network, stored)

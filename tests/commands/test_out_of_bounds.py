@@ -28,11 +28,12 @@ from dln_jax.commands import (
     train_locomotion,
     train_value,
 )
+from dln_jax.commands.values import plants
 from dln_jax.data import schema
 from dln_jax.runs.arguments import arguments_of
 from dln_jax.runs.folder import with_stored_arguments, write_config
-from dln_jax.zoo.run import load
-from dln_jax.zoo.value_functions import network_of, plant_named, save_value
+from dln_jax.zoo.run import load, save
+from dln_jax.zoo.value_functions import network_of, plant_of_model, save_value
 
 ROBOT = """<robot name="r"><link name="b"/><link name="l"><inertial><mass value="1"/>
 <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link><joint name="j" type="revolute">
@@ -111,8 +112,16 @@ def test_a_joint_whose_torque_stays_the_same_is_examined(here):
 
 
 VALUES = [
-    *('{"plant": 3}', '{"plant": "teapot"}', '{"goal": ["x"]}', '{"goal": [[1]]}', '{"goal": [1.0, 2.0, 3.0]}'),
-    *('{"dtype": []}', '{"dtype": "int32"}', '{"network": null}', '{"network": []}', '{"network": {"widths": [4]}}'),
+    *(
+        '{"plant": 3}',
+        '{"own": null}',
+        '{"own": {}}',
+        '{"dtype": []}',
+        '{"dtype": "int32"}',
+        '{"network": null}',
+        '{"network": []}',
+        '{"network": {"widths": [4]}}',
+    ),
     *('{"tensors": 3}', '{"tensors": {"a": 1}}', '{"tensors": {"a": {"shape": [-1]}}}'),
     '{"tensors": {"a": {"shape": ["x"]}}}',
 ]
@@ -120,13 +129,19 @@ VALUES = [
 
 def test_damaged_value_functions_are_refused(tmp_path):
     settings = {"widths": [4], "members": 1, "activation": "tanh", "floor": 1e-3, "scale": 30.0}
-    network = network_of(plant_named("pendulum").problem, settings)
-    save_value(tmp_path, "pendulum", None, settings, network.init(jax.random.key(0)))
+    known, layout, _ = plants.of_file(plants.file_of("pendulum"))
+    own = plants.problem_of(known, layout)
+    network = network_of(plant_of_model(known.model, known.parameters, own), settings)
+    save(tmp_path, known.description, known.parameters)
+    save_value(tmp_path, "pendulum", settings, network.init(jax.random.key(0)), own)
     path = tmp_path / "value.json"
     stored = json_of(path)
     load(tmp_path)
     networks = [{"network": {**stored["network"], name: "x"}} for name in stored["network"]]
-    for change in [*map(json.loads, VALUES), *networks]:
+    short = [
+        {"own": {**stored["own"], name: value[:-1]}} for name, value in stored["own"].items() if isinstance(value, list)
+    ]
+    for change in [*map(json.loads, VALUES), *networks, *short]:
         path.write_text(json.dumps({**stored, **change}))
         with one_line():
             load(tmp_path)

@@ -8,13 +8,13 @@ from calls import assert_refused, command, exit_status, json_of, one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.commands import train_value
-from dln_jax.commands.values import evaluation, plants
+from dln_jax.commands.values import plants
 from dln_jax.commands.values import run as training
-from dln_jax.commands.values.evaluation import verdict_of
+from dln_jax.commands.values.evaluation import value_error, verdict_of
+from dln_jax.control.closed_loop import ClosedLoopRun
 from dln_jax.control.optimal.action_costs import quadratic
 from dln_jax.control.optimal.fitted import Iteration
-from dln_jax.control.optimal.plants import Evaluation, Starts, ValuePlant, evaluate
-from dln_jax.control.optimal.problem import ControlProblem, rates
+from dln_jax.control.optimal.problem import ControlProblem, from_field, rates
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.zoo.run import load, save
 from dln_jax.zoo.value_functions import ValueRun, plant_of_model
@@ -97,16 +97,15 @@ def test_error_of_a_known_value_is_that_of_the_quadrature():
         ("prismatic",),
         [0.0],
     )
-    plant = ValuePlant(problem, 1.0, Starts([0.0], [0.0], [1.0]), (0,), evaluation=Evaluation(1000.0, 10.0, 1))
     value = lambda scale, x: (scale * x[0] ** 2 / 4, scale * x / 2)  # noqa: E731
     network = value_network(problem)._replace(value_and_gradient=value)
-    runs = evaluate(plant, lambda x: -x / 2, np.linspace(0.3, 0.9, 4)[:, None])
+    t = np.tile(np.linspace(0, 10, 10001), (4, 1))
+    x = np.linspace(0.3, 0.9, 4)[:, None, None] * np.exp(-t / 2)[..., None]
+    runs = ClosedLoopRun(t, x, -x[:, :-1] / 2, x)
     for scale in (1.0, 1.2):
-        error = evaluation.value_error(ValueRun("integrator", plant, network, scale), runs)
-        assert error == pytest.approx(scale - 1, abs=2e-3)
-    assert np.isnan(
-        evaluation.value_error(ValueRun("", plant, network, 1.0), runs._replace(settled=np.full(4, np.inf)))
-    )
+        of = ValueRun("integrator", problem, None, network, scale)
+        assert value_error(of, runs, np.zeros(4)) == pytest.approx(scale - 1, abs=2e-3)
+    assert np.isnan(value_error(of, runs, np.full(4, np.inf)))
 
 
 def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys, rod):
@@ -120,10 +119,9 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys, rod):
         "--positions -1:1": "is outside",
         "--weights 1": "expected 2 positive numbers",
         "--robust 1.5": "robust is 1.5",
+        "--run /nowhere": "no such file",
     }
     assert_refused(capsys, train_value, rows.items(), "--plant", rod, out=tmp_path / "run")
-    rows = {"--effort 1": "--effort is an option of one's own plant", "--run /nowhere": "no such file"}
-    assert_refused(capsys, train_value, rows.items(), out=tmp_path / "run")
 
 
 def test_the_model_in_a_folder_is_the_same_plant_as_its_file(tmp_path, rod):
@@ -136,11 +134,11 @@ def test_the_model_in_a_folder_is_the_same_plant_as_its_file(tmp_path, rod):
     x, u = jnp.array([0.7, 1.0]), jnp.array([1.5])
     plant = plant_of_model(known.model, known.parameters, problem)
     from_folder = plant_of_model(stored.model, stored.parameters, other)
-    assert_allclose(*[rates(one.problem)(x, u) for one in (from_folder, plant)], rtol=1e-9)
+    assert_allclose(*[rates(one)(x, u) for one in (from_folder, plant)], rtol=1e-9)
     # A body of 1.2 times the mass is accelerated by the motor 1 / 1.2 as much.
-    _, altered = plants.uncertain_numbers(plant, known, problem)
-    heavy = plants.with_factors(plant, altered, jnp.array([1.2, 1.0]))
-    ratio = heavy.problem.actuation(x)[1, 0] / plant.problem.actuation(x)[1, 0]
+    _, altered = plants.uncertain_numbers(known, problem)
+    _, actuation = from_field(altered(jnp.array([1.2, 1.0])), 1)
+    ratio = actuation(x)[1, 0] / plant.actuation(x)[1, 0]
     assert float(ratio) == pytest.approx(1 / 1.2, rel=1e-9)
     with one_line("states no limits of the motors"):
         plants.of_run(tmp_path)

@@ -8,6 +8,7 @@ from calls import assert_refused, command, json_of
 from dln_jax.commands import train_value
 from dln_jax.zoo.run import load
 
+pytest.importorskip("mujoco", reason="MuJoCo reads the files; it is in the extra [robot]")
 TINY = "--method residual --width 3 --depth 1 --iterations 1 --starts 3"
 
 
@@ -28,11 +29,11 @@ def test_a_run_is_stored_and_comes_back(tmp_path, capsys):
 
 def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys):
     rows = {
-        "--plant unicycle": "plant 'unicycle' is unknown; choose from pendulum",
+        "--plant unicycle": "plant 'unicycle' is unknown; choose from cart-pole, pendulum",
         "--method guess": "choose from fitted, residual",
-        "--goal 1.2": "limits cannot hold the goal",
-        "--plant cart-pole --goal 0,0.5": "not an equilibrium",
-        "--goal 0,0": "expected the posture of pendulum, which has 1",
+        "--goal 1.2": "the limits are [2.5]",
+        "--plant cart-pole --goal 0,0.5": "no equilibrium near the goal",
+        "--goal 0,0": "expected a number, or 1 numbers",
         "--goal up": "expected finite numbers",
         "--stored /nowhere": "no such file",
     }

@@ -10,8 +10,8 @@ import pytest
 from calls import one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dln_jax.control.plan_limits import free_time, with_limits_of, worst_violation
-from dln_jax.control.shooting import optimise, shoot
+from dln_jax.control.constraints import free_time, with_limits_of, worst_violation
+from dln_jax.control.shooting import shoot
 from dln_jax.control.trajectories import TrajectoryProblem
 from dln_jax.solvers.ending import Ending
 
@@ -54,7 +54,7 @@ def at_most(soft=None):
 
 def test_limits_hard_and_soft_constraints_and_single_shooting_give_the_same_plan():
     limited = TO_ONE._replace(upper_x=np.array([np.inf, 0.6]))
-    single = optimise(limited, np.zeros(2), STILL[1])
+    single = shoot(limited, np.zeros(2), None, STILL[1], method="single").plan
     assert single.converged and worst_violation(limited, single) == "all constraints hold within 1e-06"
     assert_allclose(single.u, at_most().plan.u, atol=1e-5)
     for solution in (shoot(limited, np.zeros(2), *STILL), at_most((1e2, 0.0))):
@@ -106,8 +106,8 @@ def test_limits_come_from_a_robot():
 
 def test_a_start_outside_limits_and_crossed_limits_are_refused():
     for change, message in (
-        ({"upper_x": np.array([0.5, np.inf])}, "state 0 starts at 1, above its upper limit of 0.5"),
-        ({"states": lambda x: x[:1] - 0.25}, "constraint 0 on the states is 0.75 at the start"),
+        ({"upper_x": np.array([0.5, np.inf])}, "violates the upper limit of state 0 at knot 0 by 0.5"),
+        ({"states": lambda x: x[:1] - 0.25}, "violates constraint 0 on the states at knot 0 by 0.75"),
         ({"lower": 1.0, "upper": -1.0}, r"limits \[0\] of the controls are not in order; expected lower < upper"),
     ):
         with one_line(message):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from calls import one_line
 
-from dln_jax.control.contradictions import require_end
+from dln_jax.control.constraints import require_end
 from dln_jax.control.shooting import shoot
 from dln_jax.control.trajectories import TrajectoryProblem
 
@@ -28,7 +28,7 @@ def test_an_end_beyond_the_limits_is_refused():
         (timed, "equation 0 of the end misses zero by 0.4 or more"),
     ):
         with one_line(message):
-            require_end(BLOCK._replace(**change), 2)
+            require_end(BLOCK._replace(**change), 2, 1)
 
 
 def test_ends_that_can_be_met_or_are_not_linear_are_not_refused():
@@ -39,7 +39,7 @@ def test_ends_that_can_be_met_or_are_not_linear_are_not_refused():
         # Linear near its middle, zero at 0.5.
         {"end": lambda x: jnp.stack([0.1 * x[0] - 0.1 + jnp.where(x[0] > 0.4, x[0] - 0.4, 0.0) * 0.5])},
     ):
-        require_end(BLOCK._replace(**change), 2)
+        require_end(BLOCK._replace(**change), 2, 1)
 
 
 def test_contradictions_are_found_while_a_caller_traces():
@@ -48,7 +48,7 @@ def test_contradictions_are_found_while_a_caller_traces():
 
     with one_line(r"misses zero by 0\.4"):
         jax.eval_shape(lambda x: traced(x, 1.0), np.zeros(2))
-    with one_line("state 0 starts at 1, above its upper limit"):
+    with one_line("the start violates the upper limit of state 0 at knot 0 by 0.4"):
         jax.eval_shape(lambda: traced(np.array([1.0, 0.0]), 0.0))
     # What is traced cannot be judged.
     jax.eval_shape(lambda place: traced(np.zeros(2), place), 1.0)

@@ -9,7 +9,7 @@ import pytest
 from calls import one_line
 from numpy.testing import assert_allclose
 
-from dln_jax.control.plan_limits import worst_violation
+from dln_jax.control.constraints import worst_violation
 from dln_jax.control.real_time import BARRIER, feedback, improve, mpc, prepare
 from dln_jax.control.shooting import shoot
 from dln_jax.control.trajectories import TrajectoryProblem, first_plan

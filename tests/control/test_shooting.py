@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from dln_jax.control.real_time import improve
 from dln_jax.control.regulators import time_varying_lqr
-from dln_jax.control.shooting import optimise, shoot
+from dln_jax.control.shooting import shoot
 from dln_jax.control.state_space import field_of, integrated
 from dln_jax.control.trajectories import TrajectoryProblem, first_plan
 from dln_jax.mechanics.equations import dynamics
@@ -49,7 +49,11 @@ def test_a_linear_problem_takes_one_iteration_to_the_recursion():
 
 
 def test_limits_hold_and_the_rest_is_stationary():
-    solve = jax.jit(lambda limit, x, u: optimise(LINEAR._replace(lower=-limit, upper=limit), x, u, tolerance=1e-9))
+
+    @jax.jit
+    def solve(limit, x, u):
+        limited = LINEAR._replace(lower=-limit, upper=limit)
+        return shoot(limited, x, None, u, method="single", tolerance=1e-9).plan
 
     def total(controls):
         x = START

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control.plan_limits import worst_violation
-from dln_jax.control.shooting import optimise, shoot
+from dln_jax.control.constraints import worst_violation
+from dln_jax.control.shooting import shoot
 from dln_jax.control.trajectories import TrajectoryProblem
 from dln_jax.solvers.ending import Ending, reason
 
@@ -36,8 +36,8 @@ def test_a_mass_that_passes_the_wall_across_its_way_has_not_converged(soft):
         assert worst_violation(problem, solution.plan).startswith("constraint 0 on the states at knot")
 
 
-@pytest.mark.parametrize("solve", ["shoot", "optimise"])
-def test_the_best_of_several_guesses_has_the_least_objective(solve):
+@pytest.mark.parametrize("method", ["multiple", "single"])
+def test_the_best_of_several_guesses_has_the_least_objective(method):
     """A well of value 0 at -1, whose price is 5, beats no well of value 0.5 at 1, which costs nothing more."""
     final = lambda x: 10 * (x[0] ** 2 - 1) ** 2 + 0.25 * (x[0] + 1)  # noqa: E731
     problem = TrajectoryProblem(
@@ -47,14 +47,20 @@ def test_the_best_of_several_guesses_has_the_least_objective(solve):
     ends = np.array([1.0, -1.0])
     u = (ends - start)[:, None, None]
     states = np.stack([np.full(2, start), ends], axis=1)[:, :, None]
-    if solve == "shoot":
-        plan = jax.jit(lambda: shoot(problem, start, states[0], u[0], starts=(states[1:], u[1:])).plan)()
-    else:
-        plan = jax.jit(lambda: optimise(problem, start, u[0], starts=u[1:]))()
+    plan = jax.jit(lambda: shoot(problem, start, states[0], u[0], method=method, starts=(states[1:], u[1:])).plan)()
     assert float(plan.x[-1, 0]) > 0.9 and plan.converged
 
 
 STEPS = 4
+
+
+def test_single_shooting_is_tried_where_multiple_shooting_fails():
+    """The end has a root at -2.1, and its least violation nearby at 1, where the states of the guess are."""
+    problem = TrajectoryProblem(lambda x, u: x + u, lambda x, u: u @ u, FREE, end=lambda x: x**3 - 3 * x + 3)
+    guess = np.ones(1), np.ones((STEPS + 1, 1)), np.full((STEPS, 1), -0.75)
+    assert int(shoot(problem, *guess, method="multiple").ending) == Ending.INFEASIBLE
+    solution = shoot(problem, *guess)
+    assert solution.plan.x[-1, 0] < -2 and solution.verdict == "single shooting converged within the tolerance"
 
 
 def hill(price):

@@ -78,7 +78,7 @@ def equation(mesh):
     start, given = network.init(jax.random.key(2)), {"samples": 9, "validation": 4, "iterations": 3, "rounds": 1}
     start = jax.tree.map(lambda leaf: leaf.astype(float), start)
     found = fit_hjb(LINE, network.value_and_gradient, start, jax.random.key(3), mesh=mesh, **given)
-    return found.parameters, len(found.stages)
+    return found.parameters, len(found.history)
 
 
 def main(folder, name, *, whole):

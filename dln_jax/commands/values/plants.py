@@ -1,4 +1,4 @@
-"""A user's own plant of a value function: of a robot file, or of the run folder of a model; and uncertain plants."""
+"""The plant of a value function: of a robot file, or of the run folder of a model; and uncertain plants."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -9,9 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control.optimal.own_plants import OwnProblem, own_problem
-from dln_jax.control.optimal.plants import ValuePlant
-from dln_jax.control.optimal.problem import from_field, rates
+from dln_jax.control.optimal.own_plants import FILES, OwnProblem, own_problem
 from dln_jax.control.plants.mujoco_plants import mujoco_plant
 from dln_jax.control.plants.plant import Layout, layout
 from dln_jax.control.plants.postures import extremes
@@ -25,6 +23,19 @@ from dln_jax.models.model import Model
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build, describe
 from dln_jax.zoo.run import Run, load
+
+OTHER_NAMES = {"furuta": "rotary-pendulum", "cartpole": "cart-pole"}
+SUFFIXES = (".xml", ".mjcf", ".urdf")
+
+
+def file_of(plant: str) -> Path:
+    """The robot file of a desktop plant with this name, or at this path."""
+    name = OTHER_NAMES.get(plant, plant)
+    if name in FILES:
+        return FILES[name]
+    if Path(plant).suffix.lower() not in SUFFIXES and not Path(plant).is_file():
+        raise InputError(f"plant '{plant}' is unknown; choose from {', '.join(FILES)}, or give the path of a file")
+    return Path(plant)
 
 
 def of_file(path: Path, actuated: Sequence[str] = (), control: Any = None, goal: Any = None) -> tuple[Run, Layout, str]:
@@ -97,17 +108,11 @@ def problem_of(run: Run, known: Layout, positions: Any = None, **wishes: Any) ->
         return own_problem(model, known, **wishes)
 
 
-def uncertain_numbers(
-    plant: ValuePlant, run: Run | None, problem: OwnProblem | None
-) -> tuple[tuple[str, ...], Callable[[Array], Field]]:
+def uncertain_numbers(run: Run, problem: OwnProblem) -> tuple[tuple[str, ...], Callable[[Array], Field]]:
     """Names of a plant's uncertain numbers, and factors of them -> its field.
 
-    These are the strengths of the motors and, of a tree of a user's own, the masses of the bodies before them.
+    These are the strengths of the motors and, of a tree, the masses of the bodies before them.
     """
-    if run is None or problem is None:
-        field = rates(plant.problem)
-        motors = plant.problem.actuation(jnp.asarray(plant.problem.goal, float)).shape[1]
-        return ("strength of motors",) * motors, lambda p: lambda x, u: field(x, p * u)
     model: Any = run.model
     parameters = jax.tree.map(np.asarray, run.parameters)
     B = np.asarray(problem.actuation)
@@ -120,10 +125,3 @@ def uncertain_numbers(
         return lambda x, u: field(x, p[masses:] * u)
 
     return (*("mass of bodies",) * masses, *("strength of motors",) * motors), altered
-
-
-def with_factors(plant: ValuePlant, altered: Callable[[Array], Field], factors: Array) -> ValuePlant:
-    """The plant with its uncertain numbers multiplied by factors."""
-    goal = jnp.asarray(plant.problem.goal, float)
-    drift, actuation = from_field(altered(factors), plant.problem.actuation(goal).shape[1])
-    return plant._replace(problem=plant.problem._replace(drift=drift, actuation=actuation))

@@ -3,9 +3,7 @@
 import dataclasses
 import itertools
 import math
-import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,42 +12,29 @@ import numpy as np
 from jax.sharding import Mesh
 
 from dln_jax.commands.values.evaluation import closed_loop, evaluation, value_plane, verdict_of
-from dln_jax.commands.values.plants import of_file, of_run, problem_of, uncertain_numbers, with_factors
-from dln_jax.control.optimal.fitted import Iteration, IterationState, ValueProgress, fit_values
+from dln_jax.commands.values.plants import file_of, of_file, of_run, problem_of, uncertain_numbers
+from dln_jax.control.optimal.fitted import Iteration, fit_values
 from dln_jax.control.optimal.own_plants import described, own_settings
-from dln_jax.control.optimal.plants import FITS, ValuePlant, ValueSettings
-from dln_jax.control.optimal.problem import ControlProblem
+from dln_jax.control.optimal.problem import ControlProblem, Disturbance, from_field, worst_disturbance
 from dln_jax.control.optimal.residual import discounts_down_to, fit_hjb
-from dln_jax.control.optimal.value_networks import ValueNetwork
-from dln_jax.control.optimal.worst_case import Bounds, Disturbance, worst_disturbance
+from dln_jax.control.optimal.value_networks import ValueFit, ValueNetwork, ValueProgress
 from dln_jax.files import finite
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.problem import Progress
 from dln_jax.precision import with_float64
-from dln_jax.runs.arguments import names_listed, numbers_of, refuse_given, require_positive_if_given
+from dln_jax.runs.arguments import names_listed, numbers_of, require_positive_if_given
 from dln_jax.runs.folder import command_folder
 from dln_jax.runs.progress import progress
 from dln_jax.runs.report import Report, finish, png, rows_of
 from dln_jax.runs.scaled import mesh_of
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import load, save
-from dln_jax.zoo.value_functions import (
-    OTHER_NAMES,
-    ValueRun,
-    network_of,
-    plant_named,
-    plant_of_model,
-    save_value,
-)
+from dln_jax.zoo.value_functions import ValueRun, network_of, plant_of_model, save_value
 
-FILES = (".xml", ".mjcf", ".urdf")
-"""Suffixes of robot files."""
-OF_OWN = ("actuated", "control", "positions", "effort", "weights", "box")
-"""Options of a user's own plant."""
 ITERATIONS = 15
 """Gauss-Newton iterations per discount."""
-OF_RESIDUAL = ValueSettings((24, 24), Iteration(), 30.0)
-"""Networks for the residual of a published plant."""
+LAYERS = {"fitted": (96, 3), "residual": (24, 2)}
+"""Width and depth of the networks by method."""
 ROUNDS = 6
 """Number of resamplings at the problem's own discount."""
 
@@ -70,48 +55,41 @@ def train(options: Any) -> None:
             f"robust is {options.robust}; expected a share of masses and motors of at least 0 and less than 1"
         )
     goal = None if options.goal is None else numbers_of("--goal", options.goal)
-    model, problem, lines = None, None, []
-    file = Path(options.plant)
-    if options.run is None and file.suffix.lower() not in FILES and not file.is_file():
-        refuse_given(options, OF_OWN, f"an option of one's own plant, and --plant is {options.plant!r:.40}")
-        name = OTHER_NAMES.get(options.plant) or str(options.plant)
-        plant = plant_named(name, goal)
-        usual = OF_RESIDUAL if options.method == "residual" else FITS[name]
-    else:
-        name = str(options.run or file)
-        actuated, control = names_listed(options.actuated), positive_numbers(options, "control")
-        control = control[0] if control is not None and len(control) == 1 else control
-        read = of_file if options.run is None else of_run
-        model, known, lacking = read(options.run or file, actuated, control, goal)
-        problem = problem_of(
-            model,
-            known,
-            None if options.positions is None else ranges_of(options.positions),
-            effort=options.effort,
-            weights=positive_numbers(options, "weights"),
-            box=positive_numbers(options, "box"),
-        )
-        plant, usual = plant_of_model(model.model, model.parameters, problem), own_settings(problem)
-        lines = [*described(problem), *filter(None, [lacking])]
-        if options.method == "residual":
-            usual = OF_RESIDUAL._replace(scale=usual.scale)
-    names, altered = uncertain_numbers(plant, model, problem)
+    actuated, control = names_listed(options.actuated), positive_numbers(options, "control")
+    control = control[0] if control is not None and len(control) == 1 else control
+    source = options.run or file_of(options.plant)
+    model, known, lacking = (of_file if options.run is None else of_run)(source, actuated, control, goal)
+    own = problem_of(
+        model,
+        known,
+        None if options.positions is None else ranges_of(options.positions),
+        effort=options.effort,
+        weights=positive_numbers(options, "weights"),
+        box=positive_numbers(options, "box"),
+    )
+    name, problem = str(options.run or options.plant), plant_of_model(model.model, model.parameters, own)
+    iteration, size = own_settings(own)
+    lines = [*described(own), *filter(None, [lacking])]
+    names, altered = uncertain_numbers(model, own)
     disturbance, extremes = None, {}
     if options.robust:
-        bounds = Bounds(parameters=options.robust)
-        disturbance = worst_disturbance(lambda x, u, p: altered(p)(x, u), np.ones(len(names)), bounds)
+        disturbance = worst_disturbance(
+            lambda x, u, p: altered(p)(x, u), np.ones(len(names)), parameters=options.robust
+        )
         for extreme, sign in (("heavy_weak", options.robust), ("light_strong", -options.robust)):
             factors = jnp.array([1 - sign if of.startswith("strength") else 1 + sign for of in names], float)
-            extremes[extreme] = with_factors(plant, altered, factors)
-    widths = [options.width or usual.widths[0]] * (options.depth or len(usual.widths))
+            drift, actuation = from_field(altered(factors), len(own.limits))
+            extremes[extreme] = problem._replace(drift=drift, actuation=actuation)
+    width, depth = LAYERS[options.method]
+    widths = [options.width or width] * (options.depth or depth)
     settings = {
         "widths": widths,
         "members": options.members or 1,
         "activation": "tanh",
         "floor": 1e-3,
-        "scale": usual.scale,
+        "scale": size,
     }
-    network, seeds = network_of(plant.problem, settings), range(options.seed, options.seed + options.seeds)
+    network, seeds = network_of(problem, settings), range(options.seed, options.seed + options.seeds)
     with command_folder(options, "train_value") as folder:
         for line in lines:
             print(line)
@@ -119,15 +97,14 @@ def train(options: Any) -> None:
         if options.robust:
             print(f"robust against errors of {options.robust:.0%} of {' and '.join(dict.fromkeys(names))}")
         if options.method == "residual":
-            trained = by_equation(
-                plant.problem, network, options.iterations or ITERATIONS, seeds, mesh=mesh, disturbance=disturbance
+            fits = by_equation(
+                problem, network, options.iterations or ITERATIONS, seeds, mesh=mesh, disturbance=disturbance
             )
         else:
-            iteration = usual.numbers._replace(iterations=options.iterations or usual.numbers.iterations)
-            own = None if model is None or problem is None else [dataclasses.asdict(problem), model.description]
-            identity = [name if own is None else own, goal, settings, iteration._asdict(), options.robust]
-            trained = by_iteration(
-                plant.problem,
+            iteration = iteration._replace(iterations=options.iterations or iteration.iterations)
+            identity = [dataclasses.asdict(own), model.description, settings, iteration._asdict(), options.robust]
+            fits = by_iteration(
+                problem,
                 network,
                 iteration,
                 seeds,
@@ -135,19 +112,19 @@ def train(options: Any) -> None:
                 mesh=mesh,
                 disturbance=disturbance,
             )
-        parameters, lowest, seconds = min(trained, key=lambda training: training[1])
-        if model is not None:
-            save(folder, model.description, model.parameters)
-        save_value(folder, name, goal, settings, parameters, problem)
-        metrics = {"train_seconds": seconds, "validation": lowest}
-        if len(trained) > 1:
-            _, validation, spent = zip(*trained, strict=True)
+        best = min(fits, key=lambda fit: fit.validation)
+        save(folder, model.description, model.parameters)
+        save_value(folder, name, settings, best.parameters, own)
+        seconds = [fit.train_seconds + fit.compile_seconds for fit in fits]
+        metrics = {"train_seconds": seconds[fits.index(best)], "validation": best.validation}
+        if len(fits) > 1:
+            validation = [fit.validation for fit in fits]
             metrics |= {
                 "validation_median": float(np.median(validation)),
-                "validation_worst": float(np.max(validation)),
-                "train_seconds_median": float(np.median(spent)),
+                "validation_worst": max(validation),
+                "train_seconds_median": float(np.median(seconds)),
             }
-        run = ValueRun(name, plant, network, with_float64(parameters), problem)
+        run = ValueRun(name, problem, own, network, with_float64(best.parameters))
         finish(folder, options, report_of(run, options, metrics, extremes))
 
 
@@ -164,7 +141,9 @@ def evaluate_stored(options: Any) -> None:
         finish(folder, options, report._replace(verdict=None, lines=lines))
 
 
-def report_of(run: ValueRun, options: Any, numbers: Mapping[str, float], extremes: Mapping[str, ValuePlant]) -> Report:
+def report_of(
+    run: ValueRun, options: Any, numbers: Mapping[str, float], extremes: Mapping[str, ControlProblem]
+) -> Report:
     """Returns of the law in the evaluation, also on extreme plants, whether its starts end upright, and figures."""
     measured = evaluation(run, options.starts, extremes)
     verdict = verdict_of(measured, options.starts)
@@ -209,42 +188,38 @@ def by_iteration(
     *,
     mesh: Mesh | None,
     disturbance: Disturbance | None,
-) -> list[tuple[Any, float, float]]:
+) -> list[ValueFit]:
     """Fits value functions by fitted value iteration, one per seed; devices share the states.
 
     Every iteration is stored in the checkpoint of its seed; a stored seed is resumed bit for bit.
     """
-    before = 0
 
-    def start(seed: int, state: IterationState) -> IterationState:
-        nonlocal before
-        before = numbers.iterations * (seed - seeds.start)
-        if (stored := restore(checkpoint(seed), state[:3])) is None:
-            return state
-        tree, history = stored
-        done = [ValueProgress(at.step, at.loss, at.validation, at.seconds) for at in history]
-        return IterationState(*tree, history=done)
+    def stored(seed: int, like: Any) -> tuple[Any, list[ValueProgress]] | None:
+        if (found := restore(checkpoint(seed), like)) is None:
+            return None
+        state, history = found
+        return state, [ValueProgress(at.step, at.loss, at.validation, at.seconds, problem.discount) for at in history]
 
-    def keep(seed: int, state: IterationState) -> None:
-        history = [Progress(at.iteration, at.loss, at.validation, math.nan, at.seconds, "") for at in state.history]
-        store(checkpoint(seed), state[:3], history)
+    def keep(seed: int, state: Any, history: list[ValueProgress]) -> None:
+        rows = [Progress(at.step, at.loss, at.validation, math.nan, at.seconds) for at in history]
+        store(checkpoint(seed), state, rows)
 
     with progress(len(seeds) * numbers.iterations, "iterations") as show:
-        fits = fit_values(
+
+        def report(seed: int, at: ValueProgress) -> None:
+            show((seed - seeds.start) * numbers.iterations + at.step, f"cost and misfit {at.validation:.4g}")
+
+        return fit_values(
             problem,
             network,
             seeds,
             numbers=numbers,
             mesh=mesh,
             disturbance=disturbance,
-            report=lambda at: show(before + at.iteration, f"cost and misfit {at.validation:.4g}"),
-            restore=start,
+            report=report,
+            restore=stored,
             store=keep,
         )
-    return [
-        (fit.parameters, min(at.validation for at in fit.history), fit.train_seconds + fit.compile_seconds)
-        for fit in fits
-    ]
 
 
 def by_equation(
@@ -255,25 +230,24 @@ def by_equation(
     *,
     mesh: Mesh | None,
     disturbance: Disturbance | None,
-) -> list[tuple[Any, float, float]]:
+) -> list[ValueFit]:
     """Fits one value function per seed by the Hamilton-Jacobi-Bellman residual; devices of a mesh share the samples."""
     discounts, done = discounts_down_to(problem.discount), itertools.count(1)
-    trained = []
+
+    def fit(seed: int) -> ValueFit:
+        of_parameters, of_samples = jax.random.split(jax.random.key(seed))
+        return fit_hjb(
+            problem,
+            network.value_and_gradient,
+            network.init(of_parameters),
+            of_samples,
+            discounts=discounts,
+            iterations=iterations,
+            rounds=ROUNDS,
+            mesh=mesh,
+            disturbance=disturbance,
+            report=lambda at: show(next(done), f"discount {at.discount:.3g}/s, residual {at.validation:.2e}"),
+        )
+
     with progress(len(seeds) * (len(discounts) - 1 + ROUNDS), "iterations") as show:
-        for seed in seeds:
-            of_parameters, of_samples = jax.random.split(jax.random.key(seed))
-            began = time.perf_counter()
-            solution = fit_hjb(
-                problem,
-                network.value_and_gradient,
-                network.init(of_parameters),
-                of_samples,
-                discounts=discounts,
-                iterations=iterations,
-                rounds=ROUNDS,
-                mesh=mesh,
-                disturbance=disturbance,
-                report=lambda at: show(next(done), f"discount {at.discount:.3g}/s, residual {at.validation:.2e}"),
-            )
-            trained.append((solution.parameters, solution.validation, time.perf_counter() - began))
-    return trained
+        return [fit(seed) for seed in seeds]

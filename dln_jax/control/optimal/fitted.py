@@ -26,13 +26,19 @@ import optax
 from jax import Array
 from jax.sharding import Mesh
 
-from dln_jax.control.optimal.flow import Targets, drawn, greedy, targets, widened
-from dln_jax.control.optimal.problem import ControlProblem
-from dln_jax.control.optimal.value_networks import ValueNetwork
-from dln_jax.control.optimal.worst_case import Disturbance
+from dln_jax.control.optimal.problem import (
+    ControlProblem,
+    Disturbance,
+    ValueAndGradient,
+    drawn,
+    flow,
+    optimal_control,
+    widened,
+)
+from dln_jax.control.optimal.value_networks import ValueFit, ValueNetwork, ValueProgress
 from dln_jax.process import held_back
 from dln_jax.scale import local, program, spread
-from dln_jax.types import InputError, require_positive
+from dln_jax.types import InputError, Scalar, require_positive
 
 VALIDATED = 256
 """Number of starts for comparing the policy's cost between iterations."""
@@ -70,42 +76,7 @@ class Iteration(NamedTuple):
     affect the value inside."""
 
 
-class ValueProgress(NamedTuple):
-    """Progress after an iteration."""
-
-    iteration: int
-    loss: float
-    validation: float
-    """Mean cost of the policy from validation states, plus the mean of |V - cost|."""
-    seconds: float
-    """Time since the start, without compilation."""
-
-
-class IterationState(NamedTuple):
-    """State after some iterations of a seed; resuming from it gives the same bits as never having stopped."""
-
-    parameters: Any
-    optimiser: Any
-    best: Any
-    """Parameters with the lowest validation so far."""
-    history: list[ValueProgress]
-
-
-Restore = Callable[[int, IterationState], IterationState]
-"""(seed, state before the first iteration) -> the state to resume from."""
-
-
-class FittedValue(NamedTuple):
-    """Result of the iterations."""
-
-    parameters: Any
-    """Parameters with the lowest validation."""
-    history: list[ValueProgress]
-    train_seconds: float
-    compile_seconds: float
-
-
-def fit_value(problem: ControlProblem, network: ValueNetwork, *, seed: int = 0, **options: Any) -> FittedValue:
+def fit_value(problem: ControlProblem, network: ValueNetwork, *, seed: int = 0, **options: Any) -> ValueFit:
     """Runs `fit_values` for one seed; `options` are its keyword arguments."""
     return fit_values(problem, network, (seed,), **options)[0]
 
@@ -120,10 +91,10 @@ def fit_values(
     double: bool = False,
     disturbance: Disturbance | None = None,
     mesh: Mesh | None = None,
-    report: Callable[[ValueProgress], None] = lambda progress: None,
-    restore: Restore = lambda seed, state: state,
-    store: Callable[[int, IterationState], None] = lambda seed, state: None,
-) -> list[FittedValue]:
+    report: Callable[[int, ValueProgress], None] = lambda seed, progress: None,
+    restore: Callable[[int, Any], tuple[Any, list[ValueProgress]] | None] = lambda seed, like: None,
+    store: Callable[[int, Any, list[ValueProgress]], None] = lambda seed, state, history: None,
+) -> list[ValueFit]:
     """Runs the iterations for several seeds, one after the other, with a program that is compiled once.
 
     The parameters of a seed are the best on separate validation states.
@@ -137,15 +108,16 @@ def fit_values(
         double: whether to compute in float64, which takes twice as long.
         disturbance: worst-case disturbance, for a robust value.
         mesh: devices that share the policy's runs; all devices do the whole fits.
-        report: called after every iteration.
-        restore: returns the state of a seed to resume from.
-        store: called with the state of a seed after every iteration.
+        report: called with the seed after every iteration.
+        restore: (seed, first state) -> the state and history to resume from with the same bits, or `None`. A state is a
+            tree of the parameters, the optimiser's state and the best parameters.
+        store: called with the seed, its state and its history after every iteration.
 
     Raises:
         InputError: a number is out of range, or the cost of the policy was never finite.
     """
     require_positive(**{name: number for name, number in numbers._asdict().items() if name != "slope_weight"})
-    subject = _Subject(widened(problem, numbers.margin), network, numbers, disturbance, mesh)
+    wide = widened(problem, numbers.margin)
     rate = optax.cosine_decay_schedule(numbers.learning_rate, numbers.iterations * numbers.steps, 0.01)
     adam = optax.adam(rate, b2=0.99)
 
@@ -153,20 +125,21 @@ def fit_values(
         """Returns parameters, state of the optimiser, and validation states."""
         start = network.init(jax.random.fold_in(key, 0)) if parameters is None else parameters
         start = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), start)
-        return start, adam.init(start), drawn(subject.problem, jax.random.fold_in(key, 1), VALIDATED)
+        return start, adam.init(start), drawn(wide, jax.random.fold_in(key, 1), VALIDATED)
 
     with jax.enable_x64(double):
         began, key = time.perf_counter(), jax.random.key(0)
         start, state, validated = begin(key)
-        advance = program(functools.partial(_iterate, subject, adam), mesh)
+        advance = program(_iteration(wide, network, numbers, adam, disturbance, mesh), mesh)
         advance = advance.lower(start, state, key, jnp.asarray(0.0)).compile()
-        judge = program(functools.partial(_score, subject), mesh).lower(start, validated).compile()
+        judge = program(_score(wide, network, numbers, disturbance, mesh), mesh).lower(start, validated).compile()
         compile_seconds = time.perf_counter() - began
 
-        def fit(seed: int) -> FittedValue:
+        def fit(seed: int) -> ValueFit:
             began, key = time.perf_counter(), jax.random.key(seed)
             current, state, validated = begin(key)
-            current, state, best, history = restore(seed, IterationState(current, state, current, []))
+            first = current, state, current
+            (current, state, best), history = restore(seed, first) or (first, [])
             history, spent = list(history), history[-1].seconds if history else 0.0
             lowest = min((at.validation for at in history if math.isfinite(at.validation)), default=math.inf)
             for number in range(len(history), numbers.iterations):
@@ -178,81 +151,119 @@ def fit_values(
                     if score < lowest:
                         best, lowest = current, score
                     passed = spent + time.perf_counter() - began
-                    history.append(ValueProgress(number + 1, float(loss), score, passed))
-                    store(seed, IterationState(current, state, best, list(history)))
-                report(history[-1])
+                    history.append(ValueProgress(number + 1, float(loss), score, passed, problem.discount))
+                    store(seed, (current, state, best), list(history))
+                report(seed, history[-1])
             if not math.isfinite(lowest):
                 raise InputError(
                     "the cost of the policy was never finite; take a smaller dt, or a box that it can stay near"
                 )
-            return FittedValue(local(best, mesh), history, history[-1].seconds, compile_seconds)
+            return ValueFit(local(best, mesh), lowest, history, history[-1].seconds, compile_seconds)
 
         return [fit(seed) for seed in seeds]
 
 
-class _Subject(NamedTuple):
-    """Problem, network and settings of the iterations."""
+def greedy(
+    problem: ControlProblem, value: ValueAndGradient, dt: float, disturbance: Disturbance | None = None
+) -> Callable[[Array], tuple[Array, Scalar]]:
+    """Returns x -> state after a step under the value's policy, and the step's cost, under the disturbance if any."""
+    step = flow(problem, dt, clipped=True)
 
-    problem: ControlProblem
-    network: ValueNetwork
-    numbers: Iteration
-    disturbance: Disturbance | None
-    mesh: Mesh | None
-    """Devices that share the trajectories; all devices do the whole fit."""
+    def closed(x: Array) -> tuple[Array, Scalar]:
+        slope = value(x)[1]
+        u = optimal_control(problem, x, slope)
+        return step(x, u, 0.0 if disturbance is None else disturbance(x, slope, u))
 
-    @property
-    def steps(self) -> int:
-        """Number of steps of a trajectory."""
-        return round(self.numbers.seconds / self.numbers.dt)
+    return closed
 
 
-def _iterate(
-    subject: _Subject, adam: optax.GradientTransformation, parameters: Any, state: Any, key: Array, memory: Array
-) -> tuple[Any, Any, Array]:
-    """Returns parameters, state of the optimiser and mean loss after an iteration with this memory, in s."""
-    problem, network, numbers = subject.problem, subject.network, subject.numbers
-    of_starts, of_batches = jax.random.split(key)
-    data = _kept_targets(subject, parameters, drawn(problem, of_starts, numbers.starts), memory)
+def targets(
+    problem: ControlProblem,
+    value: ValueAndGradient,
+    x: Array,
+    *,
+    steps: int,
+    dt: float,
+    memory: Any,
+    disturbance: Disturbance | None = None,
+) -> tuple[Array, Array, Array]:
+    """Returns all states of the trajectory from x [n] except the last, and the targets of V and of its slope there.
+
+    Args:
+        problem: the control problem.
+        value: the present value function.
+        x: initial state.
+        steps: N.
+        dt: s.
+        memory: memory of the weights, s.
+        disturbance: worst disturbance, held over a step like the controls.
+    """
+    closed = greedy(problem, value, dt, disturbance)
+    share, discount = jnp.exp(-dt / jnp.asarray(memory, x.dtype)), math.exp(-problem.discount * dt)
+
+    def forward(x: Array, _: Any) -> tuple[Array, Array]:
+        return closed(x)[0], x
+
+    last, states = jax.lax.scan(forward, x, length=steps)
+
+    def back(carry: tuple[Array, ...], x: Array) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
+        V_next, slope_next, G, p = carry
+        (_, cost), pull_back = jax.vjp(closed, x)
+        G = cost + discount * ((1 - share) * V_next + share * G)
+        (p,) = pull_back((discount * ((1 - share) * slope_next + share * p), jnp.ones_like(cost)))
+        return (*value(x), G, p), (G, p)
+
+    V_end, slope_end = value(last)
+    _, (G, p) = jax.lax.scan(back, (V_end, slope_end, V_end, slope_end), states, reverse=True)
+    return states, G, p
+
+
+def _iteration(
+    problem: ControlProblem,
+    network: ValueNetwork,
+    numbers: Iteration,
+    adam: optax.GradientTransformation,
+    disturbance: Disturbance | None,
+    mesh: Mesh | None,
+) -> Callable[[Any, Any, Array, Array], tuple[Any, Any, Array]]:
+    """Returns one iteration: (parameters, optimiser's state, key, memory in s) -> the first two, and the mean loss."""
     half = jnp.asarray((np.asarray(problem.high) - np.asarray(problem.low)) / 2, float)
-    largest = jnp.quantile(data.V, 0.9)
+    steps = round(numbers.seconds / numbers.dt)
+    index = np.unique((steps * (np.arange(numbers.kept) / numbers.kept) ** 2).astype(int))
 
-    def loss(parameters: Any, batch: Targets) -> Array:
-        V, slope = jax.vmap(lambda x: network.members(parameters, x))(batch.x)
-        size = (batch.V + numbers.floor * largest)[:, None]
-        off = (V - batch.V[:, None]) / size
-        off_slope = (slope - batch.slope[:, None]) * half / size[..., None]
-        return jnp.mean(_robust(off)) + numbers.slope_weight * jnp.mean(_robust(off_slope))
+    def of_start(parameters: Any, memory: Array, x: Array) -> tuple[Array, Array, Array]:
+        value = lambda x: network.value_and_gradient(parameters, x)  # noqa: E731
+        return targets(problem, value, x, steps=steps, dt=numbers.dt, memory=memory, disturbance=disturbance)
 
-    def descend(carry: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], Array]:
-        parameters, state = carry
-        batch = jax.tree.map(lambda rows: rows[jax.random.randint(key, (numbers.batch,), 0, len(data.V))], data)
-        value, gradient = jax.value_and_grad(loss)(parameters, batch)
-        updates, state = adam.update(gradient, state, parameters)
-        return (optax.apply_updates(parameters, updates), state), value
+    # Devices share the trajectories; all of them do the whole fit.
+    trajectories = spread(lambda shared, x: jax.vmap(functools.partial(of_start, *shared))(x), mesh)
 
-    keys = jax.random.split(of_batches, numbers.steps)
-    (parameters, state), losses = jax.lax.scan(descend, (parameters, state), keys)
-    return parameters, state, jnp.mean(losses)
+    def iterate(parameters: Any, state: Any, key: Array, memory: Array) -> tuple[Any, Any, Array]:
+        of_starts, of_batches = jax.random.split(key)
+        rows = trajectories((parameters, memory), drawn(problem, of_starts, numbers.starts))
+        data = jax.tree.map(lambda rows: rows[:, index].reshape(-1, *rows.shape[2:]), rows)
+        largest = jnp.quantile(data[1], 0.9)
 
+        def loss(parameters: Any, batch: tuple[Array, Array, Array]) -> Array:
+            x, V_target, slope_target = batch
+            V, slope = jax.vmap(lambda x: network.members(parameters, x))(x)
+            size = (V_target + numbers.floor * largest)[:, None]
+            off = (V - V_target[:, None]) / size
+            off_slope = (slope - slope_target[:, None]) * half / size[..., None]
+            return jnp.mean(_robust(off)) + numbers.slope_weight * jnp.mean(_robust(off_slope))
 
-def _kept_targets(subject: _Subject, parameters: Any, x: Array, memory: Array) -> Targets:
-    """Returns targets at some states of the trajectories from x [N, n], one row per state."""
+        def descend(carry: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], Array]:
+            parameters, state = carry
+            batch = jax.tree.map(lambda rows: rows[jax.random.randint(key, (numbers.batch,), 0, len(rows))], data)
+            value, gradient = jax.value_and_grad(loss)(parameters, batch)
+            updates, state = adam.update(gradient, state, parameters)
+            return (optax.apply_updates(parameters, updates), state), value
 
-    def of_start(parameters: Any, memory: Array, x: Array) -> Targets:
-        return targets(
-            subject.problem,
-            lambda x: subject.network.value_and_gradient(parameters, x),
-            x,
-            steps=subject.steps,
-            dt=subject.numbers.dt,
-            memory=memory,
-            disturbance=subject.disturbance,
-        )
+        keys = jax.random.split(of_batches, numbers.steps)
+        (parameters, state), losses = jax.lax.scan(descend, (parameters, state), keys)
+        return parameters, state, jnp.mean(losses)
 
-    trajectories = spread(lambda shared, x: jax.vmap(functools.partial(of_start, *shared))(x), subject.mesh)
-    kept = subject.numbers.kept
-    index = np.unique((subject.steps * (np.arange(kept) / kept) ** 2).astype(int))
-    return jax.tree.map(lambda rows: rows[:, index].reshape(-1, *rows.shape[2:]), trajectories((parameters, memory), x))
+    return iterate
 
 
 def _robust(off: Array) -> Array:
@@ -261,26 +272,32 @@ def _robust(off: Array) -> Array:
     return size**2 * (jnp.sqrt(1 + (off / size) ** 2) - 1)
 
 
-def _score(subject: _Subject, parameters: Any, x: Array) -> Array:
-    """Returns the mean cost of the policy from states x [N, n], plus the mean of |V - cost|."""
-    problem, network, dt = subject.problem, subject.network, subject.numbers.dt
-    steps = round(subject.numbers.followed * subject.steps)
+def _score(
+    problem: ControlProblem,
+    network: ValueNetwork,
+    numbers: Iteration,
+    disturbance: Disturbance | None,
+    mesh: Mesh | None,
+) -> Callable[[Any, Array], Array]:
+    """Returns (parameters, states [N, n]) -> the mean cost of the policy, plus the mean of |V - cost|."""
+    steps = round(numbers.followed * round(numbers.seconds / numbers.dt))
+    discount = math.exp(-problem.discount * numbers.dt)
 
     def one(parameters: Any, x: Array) -> tuple[Array, Array]:
         value = lambda x: network.value_and_gradient(parameters, x)  # noqa: E731
-        closed, discount = greedy(problem, value, dt, subject.disturbance), math.exp(-problem.discount * dt)
+        closed = greedy(problem, value, numbers.dt, disturbance)
 
         def forward(carry: tuple[Array, Array, Array], _: Any) -> tuple[tuple[Array, Array, Array], None]:
             x, total, weight = carry
             after, cost = closed(x)
             return (after, total + weight * cost, weight * discount), None
 
-        (last, total, weight), _ = jax.lax.scan(
-            forward,
-            (x, jnp.zeros((), x.dtype), jnp.ones((), x.dtype)),
-            length=steps,
-        )
+        start = x, jnp.zeros((), x.dtype), jnp.ones((), x.dtype)
+        (last, total, weight), _ = jax.lax.scan(forward, start, length=steps)
         return value(x)[0], total + weight * value(last)[0]
 
-    V, cost = spread(jax.vmap(one, (None, 0)), subject.mesh)(parameters, x)
-    return jnp.mean(cost + jnp.abs(V - cost))
+    def score(parameters: Any, x: Array) -> Array:
+        V, cost = spread(jax.vmap(one, (None, 0)), mesh)(parameters, x)
+        return jnp.mean(cost + jnp.abs(V - cost))
+
+    return score

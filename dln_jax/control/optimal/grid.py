@@ -7,7 +7,8 @@ feet x(dt) of characteristics, and linear interpolation gives V there. This make
 point unique: it converges to the viscosity solution, and Howard's policy iteration (1960), which never raises V,
 converges to the fixed point. (With cubic interpolation it did not at ridges.) The candidates for a control are the
 present one, a list over the range, and the controls u = grad g*(-Bᵀ V_x) for the slopes of V on both sides, by the
-conjugate of their cost. Coarse grids initialise fine ones.
+conjugate of their cost. Coarse grids initialise fine ones. The result is read by cubics, which do not overshoot at
+ridges, because they are limited to the values of the four surrounding corners (Bermejo and Staniforth 1992).
 
 Linear interpolation has an error of O(h²/dt) and held controls of O(dt²), so dt should be as long as the controls
 allow. The change between two grids estimates the distance of V from its limit; `extrapolated` removes most of it where
@@ -25,9 +26,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from dln_jax.control.optimal.flow import Flow, flow
-from dln_jax.control.optimal.grid_interpolation import Grid, interpolated, linear, one_sided_slopes, read
-from dln_jax.control.optimal.problem import ControlProblem, circles, optimal_control
+from dln_jax.control.optimal.problem import ControlProblem, Flow, circles, flow, optimal_control
 from dln_jax.control.state_space import Law
 from dln_jax.solvers.ending import Ending
 from dln_jax.types import InputError, require_positive
@@ -36,6 +35,24 @@ CONTROLS = 25
 """Number of listed controls."""
 SWEEPS = 20_000
 """Largest number of sweeps of the value between two improvements of the policy."""
+
+
+class Grid(NamedTuple):
+    """Nodes of a rectangle; hashable."""
+
+    low: tuple[float, ...]
+    steps: tuple[float, ...]
+    """Distance between neighbouring nodes along each side."""
+    shape: tuple[int, ...]
+    circle: tuple[bool, ...]
+    """Whether a side is a circle: its last node is its first and is not stored."""
+
+    @property
+    def nodes(self) -> Float[np.ndarray, "A B 2"]:
+        """Coordinates of all nodes."""
+        sides = zip(self.low, self.steps, self.shape, strict=True)
+        axes = [start + step * np.arange(count) for start, step, count in sides]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
 class GridValue(NamedTuple):
@@ -202,3 +219,56 @@ def _iterate(
     _, V, u, change = jax.lax.while_loop(going, iterate, start)
     ended = jnp.where(change <= tolerance, Ending.CONVERGED, Ending.OUT_OF_ITERATIONS)
     return V, u, change, jnp.where(jnp.isfinite(change) & jnp.isfinite(V).all(), ended, Ending.NOT_FINITE)
+
+
+def linear(grid: Grid, x: Array) -> tuple[Array, ...]:
+    """Returns the stencil of bilinear interpolation at states x [..., 2]; beyond an edge, the edge's value applies.
+
+    It holds rows and columns of nodes [k, ...], and weights of both, which are not negative and sum to one.
+    """
+    return _stencil(grid, x, (0, 1))
+
+
+def read(values: Array, at: tuple[Array, ...]) -> Array:
+    """Interpolates values at the nodes [A, B] to the states of a stencil."""
+    rows, columns, row_weights, column_weights = at
+    count = len(rows)
+    total = jnp.zeros(rows.shape[1:], values.dtype)
+    for i in range(count):
+        total += row_weights[i] * sum(column_weights[j] * values[rows[i], columns[j]] for j in range(count))
+    return total
+
+
+def interpolated(grid: Grid, values: Array, x: Any) -> Array:
+    """Interpolates values at the nodes [A, B], such as V, to states [..., 2] by limited cubics."""
+    smooth = read(values, _stencil(grid, jnp.asarray(x), (-1, 0, 1, 2)))
+    rows, columns, *_ = linear(grid, jnp.asarray(x))
+    corners = jnp.stack([values[row, column] for row in rows for column in columns])
+    return jnp.clip(smooth, jnp.min(corners, axis=0), jnp.max(corners, axis=0))
+
+
+def one_sided_slopes(grid: Grid, values: Array, axis: int) -> tuple[Array, Array]:
+    """Returns backward and forward difference quotients along an axis; at an edge both are the one that exists."""
+    forward = (jnp.roll(values, -1, axis) - values) / grid.steps[axis]
+    backward = jnp.roll(forward, 1, axis)
+    if grid.circle[axis]:
+        return backward, forward
+    place = jnp.arange(values.shape[axis]).reshape([-1 if side == axis else 1 for side in range(values.ndim)])
+    first, last = place == 0, place == values.shape[axis] - 1
+    return jnp.where(first, forward, backward), jnp.where(last, backward, forward)
+
+
+def _stencil(grid: Grid, x: Array, offsets: tuple[int, ...]) -> tuple[Array, ...]:
+    """Returns the stencil of Lagrange polynomials through the nodes at these offsets from a state's cell."""
+    nodes, weights = [], []
+    for axis, (low, step, count, circle) in enumerate(zip(*grid, strict=True)):
+        place = (x[..., axis] - low) / step
+        place = place if circle else jnp.clip(place, 0.0, count - 1.0)
+        # At an edge all nodes lie on one side of the cell.
+        cell = jnp.floor(place) if circle else jnp.clip(jnp.floor(place), -offsets[0], count - 1.0 - offsets[-1])
+        s = place - cell
+        own = [math.prod((s - k) / (j - k) for k in offsets if k != j) for j in offsets]
+        around = cell.astype(jnp.int32) + jnp.array(offsets).reshape(-1, *[1] * place.ndim)
+        nodes.append(jnp.mod(around, count) if circle else around)
+        weights.append(jnp.stack(own))
+    return (*nodes, *weights)

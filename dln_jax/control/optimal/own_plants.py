@@ -16,6 +16,7 @@ Times of the fit and of the discount are multiples of 1 / lambda.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -25,13 +26,11 @@ from jax import Array
 
 from dln_jax.control.optimal.action_costs import centred, limited_atan, stretched
 from dln_jax.control.optimal.fitted import Iteration
-from dln_jax.control.optimal.plants import MARGIN, Evaluation, Starts, ValuePlant, ValueSettings
 from dln_jax.control.optimal.problem import ControlProblem, checked, from_plant
-from dln_jax.control.plants.plant import ACTIVE_SPREAD, SPREAD, Layout
+from dln_jax.control.plants.plant import Layout
 from dln_jax.control.state_space import field_of, holding_controls
 from dln_jax.control.swing_up import nearest_equilibrium
 from dln_jax.mechanics.dynamics import Dynamics, InverseForward
-from dln_jax.mechanics.integrators import rk4
 from dln_jax.nn.activations import softplus
 from dln_jax.types import InputError, JointKind, Scalar
 
@@ -47,6 +46,10 @@ NEAR = 0.2
 """Largest angle from the goal that counts as up, rad."""
 SLOWEST = 1e-6
 """Smallest lambda of a plant that moves, 1/s."""
+MARGIN = 1e-3
+"""Margin of the action cost's range beyond the limits."""
+FILES = {path.stem: path for path in sorted((Path(__file__).parent / "mjcf").glob("*.xml"))}
+"""MJCF files of desktop plants by name."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,11 @@ class OwnProblem:
             kind == "revolute" and low is None and high is None
             for kind, (low, high) in zip(self.joints, self.positions, strict=True)
         )
+
+    @property
+    def ranges(self) -> np.ndarray:
+        """Limits of the coordinates [d, 2], infinite for none."""
+        return np.array([(-np.inf if a is None else a, np.inf if b is None else b) for a, b in self.positions])
 
 
 def own_problem(
@@ -183,23 +191,27 @@ def _finite(number: float) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def own_plant(model: Dynamics | InverseForward, numbers: OwnProblem) -> ValuePlant:
-    """Returns the control problem with its evaluation.
-
-    The evaluation starts near hanging, or at rest anywhere on circles and in a third of other sides of the box. It
-    integrates by the classical Runge-Kutta method for 40 / lambda. A run that leaves the limits of a coordinate fails.
+def own_plant(model: Dynamics | InverseForward, numbers: OwnProblem) -> ControlProblem:
+    """Returns the control problem.
 
     Args:
         model: smooth model of the plant.
         numbers: from `own_problem`, for this model.
 
     Raises:
-        InputError: the numbers do not fit the model; see `checked`.
+        InputError: numbers are missing, or do not fit the model; see `checked`.
     """
     d, scale = len(numbers.joints), numbers.scale
+    one_each = ("names", "actuation", "positions", "goal", "hanging")
+    for name, count in {**dict.fromkeys(one_each, d), "weights": 2 * d, "box": 2 * d}.items():
+        if len(stated := getattr(numbers, name)) != count:
+            raise InputError(f"{name} has {len(stated)} entries; expected {count} for {d} coordinates")
+    motors = len(numbers.limits)
+    if any(len(row) != motors for row in numbers.actuation):
+        raise InputError(f"actuation is {numbers.actuation}; expected a column for each of {motors} limits")
     goal = np.concatenate([numbers.goal, np.zeros(d)])
     half, turning = np.asarray(numbers.box), np.array(numbers.turning)
-    ranges = np.array([(-np.inf if a is None else a, np.inf if b is None else b) for a, b in numbers.positions])
+    ranges = numbers.ranges
     bounded = np.isfinite(ranges).all(axis=1)
     middle = goal.copy()
     middle[:d][bounded] = ranges[bounded].mean(axis=1)
@@ -218,19 +230,7 @@ def own_plant(model: Dynamics | InverseForward, numbers: OwnProblem) -> ValuePla
         u = np.linalg.lstsq(np.asarray(B), -np.asarray(a), rcond=None)[0]
         if np.max(np.abs(u / limit)) > 1e-9:
             problem = problem._replace(action_cost=centred(cost, u))
-        problem = checked(problem, tolerance=1e-6 * (1 + scale**2))
-    driven = (np.asarray(numbers.actuation) != 0).any(axis=1)
-    spread = np.where(driven, ACTIVE_SPREAD, SPREAD)
-    still = np.full(d, 0.01)
-    starts = Starts(
-        [*numbers.hanging, *np.zeros(d)], [*spread**2, *(still**2)], [*np.where(turning, np.pi, half[:d] / 3), *still]
-    )
-    evaluation = Evaluation(
-        rate=20 * scale, seconds=HORIZON / scale, held=1, method=rk4, clipped=False, near=NEAR,
-        positions=ranges if np.isfinite(ranges).any() else None,
-    )  # fmt: skip
-    angles = tuple(k for k, kind in enumerate(numbers.joints) if kind == "revolute")
-    return ValuePlant(problem, limit, starts, angles or tuple(range(d)), evaluation=evaluation)
+        return checked(problem, tolerance=1e-6 * (1 + scale**2))
 
 
 def _state_cost(
@@ -256,14 +256,13 @@ def _state_cost(
     return cost
 
 
-def own_settings(numbers: OwnProblem, widths: Sequence[int] = (96, 96, 96)) -> ValueSettings:
-    """Returns the settings of the fit, with times in units of 1 / lambda."""
+def own_settings(numbers: OwnProblem) -> tuple[Iteration, float]:
+    """Returns the settings of the iteration, with times in units of 1 / lambda, and the factor on V of its network."""
     unit = 1 / numbers.scale
-    iteration = Iteration(
+    return Iteration(
         iterations=80, starts=2048, kept=6, steps=250, slope_weight=0.1, floor=0.01, followed=4.0,
         dt=0.1 * unit, seconds=12 * unit, first_memory=0.8 * unit, memory=HORIZON * unit,
-    )  # fmt: skip
-    return ValueSettings(tuple(widths), iteration, 10 * math.pi**2 * unit)
+    ), 10 * math.pi**2 * unit  # fmt: skip
 
 
 def described(numbers: OwnProblem) -> list[str]:

@@ -19,11 +19,16 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from dln_jax.control.optimal.action_costs import ActionCost, centred
+from dln_jax.control.optimal.action_costs import ActionCost
 from dln_jax.control.state_space import Field, Law, circular, field_of, where_finite
 from dln_jax.mechanics.dynamics import Dynamics, InverseForward
-from dln_jax.types import InputError, JointKind, Scalar
+from dln_jax.mechanics.integrators import rk4
+from dln_jax.types import InputError, JointKind, Scalar, require_positive
 
+Flow = Callable[..., tuple[Array, Scalar]]
+"""(x [n], u [m], change of dx/dt [n], none by default) -> the state after a step [n], and its discounted cost."""
+Disturbance = Callable[[Array, Array, Array], Array]
+"""(x, V_x, u) -> the change of dx/dt [n] due to the worst disturbance."""
 ValueAndGradient = Callable[[Array], tuple[Scalar, Array]]
 """x [n] -> V and V_x [n]."""
 
@@ -51,11 +56,8 @@ class ControlProblem(NamedTuple):
     """x0 [n], at rest without control."""
 
 
-class Affine(NamedTuple):
-    """dx/dt = a(x) + B(x) u."""
-
-    drift: Callable[[Array], Array]
-    actuation: Callable[[Array], Array]
+Affine = tuple[Callable[[Array], Array], Callable[[Array], Array]]
+"""a and B of dx/dt = a(x) + B(x) u."""
 
 
 def from_plant(plant: Dynamics | InverseForward, actuation: Any = None) -> Affine:
@@ -79,11 +81,8 @@ def from_field(field: Field, controls: int | None = None) -> Affine:
     def rest(x: Array) -> Array:
         return jnp.zeros(len(x) // 2 if controls is None else controls, x.dtype)
 
-    return Affine(
-        lambda x: field(x, rest(x)),
-        # The field is affine, so the derivative is the same at all controls.
-        lambda x: jax.jacfwd(lambda u: field(x, u))(rest(x)),
-    )
+    # The field is affine, so its derivative is the same at all controls.
+    return lambda x: field(x, rest(x)), lambda x: jax.jacfwd(lambda u: field(x, u))(rest(x))
 
 
 def rates(problem: ControlProblem) -> Field:
@@ -141,42 +140,70 @@ def checked(problem: ControlProblem, *, tolerance: float = 1e-6) -> ControlProbl
     return problem._replace(low=low, high=high, goal=goal)
 
 
-def at_goal(problem: ControlProblem, goal: Any, *, tolerance: float = 1e-6) -> ControlProblem:
-    """Returns the problem with another goal.
-
-    The state cost is shifted, and controls cost their difference from the one that holds the new goal.
-
-    Args:
-        problem: with zero cost at its goal.
-        goal: state [n].
-        tolerance: largest remaining dx/dt.
-
-    Raises:
-        InputError: no control holds the goal, or none within the limits of the action cost.
-    """
-    goal, before = jnp.asarray(goal, float), jnp.asarray(problem.goal, float)
-    if goal.shape != before.shape:
-        raise InputError(f"the goal has shape {goal.shape}; expected {before.shape}, a state")
-    drift, B = jax.jit(lambda x: (problem.drift(x), problem.actuation(x)))(goal)
-    u = jnp.linalg.lstsq(B, -drift)[0]
-    moving = float(jnp.max(jnp.abs(drift + B @ u)))
-    if not moving <= tolerance:
-        raise InputError(
-            f"the goal is not an equilibrium: no control makes dx/dt less than {moving:.3g} there; give another"
-        )
-    cost = problem.state_cost
-    return checked(
-        problem._replace(
-            state_cost=lambda x: cost(x - (goal - before)),
-            action_cost=centred(problem.action_cost, u),
-            goal=np.asarray(goal),
-        )
-    )
-
-
 def circles(problem: ControlProblem) -> Bool[np.ndarray, " n"]:
     """Returns the mask of the coordinates that are angles on a circle."""
     return circular(problem.joints, len(problem.low))
+
+
+def limits(problem: ControlProblem) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the box, without limits for angles on a circle."""
+    angles = circles(problem)
+    return np.where(angles, -np.inf, problem.low), np.where(angles, np.inf, problem.high)
+
+
+def uniform(problem: ControlProblem, key: Array, samples: int) -> Float[Array, "samples n"]:
+    """Returns random states, uniform in the box."""
+    low, high = jnp.asarray(problem.low, float), jnp.asarray(problem.high, float)
+    return jax.random.uniform(key, (samples, len(low)), low.dtype, low, high)
+
+
+def flow(problem: ControlProblem, dt: float, *, clipped: bool = False) -> Flow:
+    """Returns the step of a problem, by the classical Runge-Kutta method with held controls.
+
+        x(t + dt),   integral from 0 to dt of e^(-rho s) (q(x(t + s)) + g(u)) ds
+
+    Args:
+        problem: defines plant and costs.
+        dt: time for which the controls are held, s.
+        clipped: whether states that are not on a circle are clipped to the box, as in published fitted iterations; this
+            changes the plant wherever trajectories leave the box.
+    """
+    require_positive(dt=dt)
+    field, rho = rates(problem), problem.discount
+    low, high = map(jnp.asarray, limits(problem))
+
+    def step(x: Array, u: Array, change: Any = 0.0) -> tuple[Array, Scalar]:
+        spent = problem.action_cost.cost(u)
+
+        def rate(t: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+            x, _ = state
+            return field(x, u) + change, jnp.exp(-rho * t) * (problem.state_cost(x) + spent)
+
+        after, cost = rk4(rate)(0.0, (x, jnp.zeros((), x.dtype)), dt)
+        return (jnp.clip(after, low.astype(x.dtype), high.astype(x.dtype)) if clipped else after), cost
+
+    return step
+
+
+def widened(problem: ControlProblem, factor: float) -> ControlProblem:
+    """Returns the problem in a box that is `factor` times as wide."""
+    low, high = np.asarray(problem.low), np.asarray(problem.high)
+    middle, half = (low + high) / 2, factor * (high - low) / 2
+    straight = ~circles(problem)
+    return problem._replace(low=np.where(straight, middle - half, low), high=np.where(straight, middle + half, high))
+
+
+def drawn(problem: ControlProblem, key: Array, count: int) -> Float[Array, "N n"]:
+    """Returns random states: half of them uniform in the box, half in boxes shrunk by a uniformly distributed factor.
+
+    Angles on a circle are uniform in both. In a box of several dimensions nearly all uniform states are far from rest,
+    where motions rarely are.
+    """
+    of_box, of_share = jax.random.split(key)
+    goal = jnp.asarray(problem.goal, float)
+    x = uniform(problem, of_box, count)
+    share = jnp.where(jnp.arange(count) % 2 == 0, 1.0, jax.random.uniform(of_share, (count,)))
+    return jnp.where(circles(problem), x, goal + share[:, None] * (x - goal))
 
 
 def features(problem: ControlProblem, x: Array) -> Float[Array, " k"]:
@@ -198,3 +225,61 @@ def hjb_policy(value_and_gradient: ValueAndGradient, problem: ControlProblem) ->
     """
     # A limited control is finite even if a rate is infinite.
     return lambda x: where_finite(optimal_control(problem, x, value_and_gradient(x)[1]), x)
+
+
+def worst_disturbance(
+    plant: Callable[[Array, Array, Array], Array],
+    p: Any,
+    *,
+    state: float = 0.0,
+    action: float = 0.0,
+    observation: float = 0.0,
+    parameters: float = 0.0,
+    lower: Any = -jnp.inf,
+    upper: Any = jnp.inf,
+) -> Disturbance:
+    """Returns the worst case of bounded disturbances, in closed form (Lutter et al. 2021, arXiv:2105.12189).
+
+        dx/dt = f(x + xi_o, u + xi_u, p + xi_p) + xi_x
+
+    Every disturbance increases the cost to go as fast as its bound permits, to first order in V_xᵀ f:
+
+        xi_x along V_x,   xi_u along Bᵀ V_x,   xi_o along (df/dx)ᵀ V_x,   all of prescribed length,
+        xi_p = +- a share of every parameter, by the sign of (df/dp)ᵀ V_x
+
+    A value function trained against them gives robust control.
+
+    Args:
+        plant: (x [n], u [m], p [k]) -> dx/dt [n], f.
+        p: parameters [k].
+        state: bound of |xi_x|, in the units of dx/dt; zero for none, as for the others.
+        action: bound of |xi_u|, in the units of u.
+        observation: bound of |xi_o|, in the units of x.
+        parameters: bound of |xi_p| / |p|.
+        lower: bound of p + xi_p [k], for example zero for masses; by default none.
+        upper: bound of p + xi_p [k]; by default none.
+
+    Raises:
+        InputError: a bound is negative.
+    """
+    bounds = {"state": state, "action": action, "observation": observation, "parameters": parameters}
+    for name, bound in bounds.items():
+        if not bound >= 0:
+            raise InputError(f"the bound of {name} is {bound}; expected 0 or more")
+    p = jnp.asarray(p, float)
+
+    def change(x: Array, slope: Array, u: Array) -> Array:
+        rate, pull_back = jax.vjp(plant, x, u, p.astype(x.dtype))
+        to_x, to_u, to_p = pull_back(slope)
+        worst_p = jnp.clip(p + parameters * jnp.abs(p) * jnp.sign(to_p), jnp.asarray(lower), jnp.asarray(upper))
+        moved = plant(x + observation * _unit(to_x), u + action * _unit(to_u), worst_p.astype(x.dtype))
+        return moved - rate + state * _unit(slope)
+
+    return change
+
+
+def _unit(z: Array) -> Array:
+    """Returns z / |z|, or zero if z is zero, with finite derivatives."""
+    square = jnp.sum(z**2)
+    some = square > 0
+    return jnp.where(some, z / jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)

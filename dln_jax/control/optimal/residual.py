@@ -10,8 +10,9 @@ and the others are far away. Training starts there and follows it while the disc
 """
 
 import functools
+import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,34 +20,13 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
-from dln_jax.control.optimal.flow import uniform
-from dln_jax.control.optimal.problem import ControlProblem, checked, hjb_residual, optimal_control
-from dln_jax.control.optimal.worst_case import Disturbance
+from dln_jax.control.optimal.problem import ControlProblem, Disturbance, checked, hjb_residual, optimal_control, uniform
+from dln_jax.control.optimal.value_networks import ValueFit, ValueProgress
 from dln_jax.precision import quick_compilation
 from dln_jax.process import held_back
 from dln_jax.scale import local, of_first_process, program
 from dln_jax.solvers import levenberg_marquardt
 from dln_jax.types import InputError, require_positive
-
-
-class ResidualStage(NamedTuple):
-    """Residuals of the equation after the fit at one discount."""
-
-    discount: float
-    iterations: int
-    residual: float
-    """Root mean square on the samples of the fit, relative to the mean of q."""
-    validation: float
-    """The same on the validation samples, with this discount."""
-
-
-class HJBFit(NamedTuple):
-    """Result of a training."""
-
-    parameters: Any
-    """Parameters with the lowest validation at the problem's own discount."""
-    validation: float
-    stages: list[ResidualStage]
 
 
 def discounts_down_to(discount: float, *, first: float = 30.0, ratio: float = 0.5, last: float = 0.01) -> list[float]:
@@ -82,8 +62,8 @@ def fit_hjb(
     patience: int = 2,
     disturbance: Disturbance | None = None,
     mesh: Mesh | None = None,
-    report: Callable[[ResidualStage], None] = lambda stage: None,
-) -> HJBFit:
+    report: Callable[[ValueProgress], None] = lambda progress: None,
+) -> ValueFit:
     """Fits a value function to the equation, in float64.
 
     Args:
@@ -99,7 +79,8 @@ def fit_hjb(
         patience: the fit ends after this many rounds without a lower validation.
         disturbance: worst-case disturbance, for a robust value function.
         mesh: devices that share the samples of a fit.
-        report: called after every draw.
+        report: called after every draw, with residuals that are root mean squares relative to the mean of q: `loss` on
+            the samples of the fit, `validation` on others, with this discount.
 
     Raises:
         InputError: the problem is invalid, the discounts do not end with its own, or the equation is not finite.
@@ -121,26 +102,28 @@ def fit_hjb(
         return left / unit
 
     @functools.partial(program, mesh=mesh, compiler_options=quick_compilation())
-    def advance(parameters: Any, x: Array, discount: Array) -> tuple[Any, Array, Array]:
+    def advance(parameters: Any, x: Array, discount: Array) -> tuple[Any, Array]:
         chunks = levenberg_marquardt.in_chunks((x, jnp.full(len(x), discount)), mesh)
         start = levenberg_marquardt.init(parameters)
         state = levenberg_marquardt.run_on_chunks(residual, start, chunks, iterations, samples=samples, mesh=mesh)
-        return state.parameters, state.iteration, jnp.sqrt(state.loss)
+        return state.parameters, jnp.sqrt(state.loss)
 
     @functools.partial(program, mesh=mesh)
     def validated(parameters: Any, discount: Array) -> Array:
         return jnp.sqrt(jnp.mean(jax.vmap(residual, (None, 0, None))(parameters, unseen, discount) ** 2))
 
-    stages: list[ResidualStage] = []
+    history: list[ValueProgress] = []
+    began = time.perf_counter()
 
     def fitted(parameters: Any, discount: float) -> Any:
-        x = uniform(problem, jax.random.fold_in(of_draws, len(stages)), samples)
+        x = uniform(problem, jax.random.fold_in(of_draws, len(history)), samples)
         with held_back():  # as in `fitted.fit_values`
-            parameters, done, loss = advance(parameters, x, jnp.asarray(discount))
+            parameters, loss = advance(parameters, x, jnp.asarray(discount))
             # This number decides how many rounds there are, so all processes must use the same value.
             left = of_first_process(float(validated(parameters, jnp.asarray(discount))), mesh)
-            stages.append(ResidualStage(discount, int(done), float(loss), float(left)))
-        report(stages[-1])
+            passed = time.perf_counter() - began
+            history.append(ValueProgress(len(history) + 1, float(loss), float(left), passed, discount))
+        report(history[-1])
         return parameters
 
     for discount in discounts[:-1]:
@@ -148,7 +131,7 @@ def fit_hjb(
     best, lowest, since = parameters, np.inf, 0
     for _ in range(rounds):
         parameters = fitted(parameters, problem.discount)
-        score = stages[-1].validation
+        score = history[-1].validation
         best, lowest, since = (parameters, score, 0) if score < lowest else (best, lowest, since + 1)
         if since >= patience:
             break
@@ -156,4 +139,4 @@ def fit_hjb(
         raise InputError(
             "the equation is not finite at the samples; look for states in the box where the plant or a cost is not"
         )
-    return HJBFit(local(best, mesh), float(lowest), stages)
+    return ValueFit(local(best, mesh), float(lowest), history, history[-1].seconds)

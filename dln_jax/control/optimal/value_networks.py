@@ -5,7 +5,8 @@
 L is lower triangular with a positive diagonal; its entries are the outputs of a differential network of z - z0
 (Lutter et al. 2021, arXiv:2105.04682). z holds the sines and cosines of angles and the other states in units of the
 box. Without hidden layers L is constant and V a quadratic form, which solves a linear-quadratic problem exactly.
-The parameters have a leading axis of ensemble members; V and V_x are the means over it.
+The parameters have a leading axis of ensemble members; V and V_x are the means over it. `fitted` and
+`residual` fit them.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,6 +34,31 @@ class ValueNetwork(NamedTuple):
     """(parameters, x [n]) -> V and V_x [n], means over the members."""
     members: Callable[[Any, Array], tuple[Array, Array]]
     """(parameters, x [n]) -> V [K] and V_x [K, n] of the members."""
+
+
+class ValueProgress(NamedTuple):
+    """Progress of a fit after an iteration, or after a draw of samples."""
+
+    step: int
+    loss: float
+    validation: float
+    """Score that selects the parameters."""
+    seconds: float
+    """Time since the start."""
+    discount: float
+    """Discount of the equation that is fitted, 1/s."""
+
+
+class ValueFit(NamedTuple):
+    """Result of a fit."""
+
+    parameters: Any
+    """Parameters with the lowest validation."""
+    validation: float
+    history: list[ValueProgress]
+    train_seconds: float
+    compile_seconds: float = 0.0
+    """Time of compilation that is not counted in `train_seconds`."""
 
 
 def value_network(

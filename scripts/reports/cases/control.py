@@ -1,8 +1,7 @@
 """Measure controllers: swing-ups, a board, learned models, foreign plants, value functions, tracking, plans, and C."""
 
-from dln_jax.control.optimal.plants import FITS
 from dln_jax.learning.kinematics.search import Search
-from scripts.reports.control import closed_loops, plans, plants, swing_ups, values
+from scripts.reports.control import closed_loops, plans, plants, published, swing_ups, values
 from scripts.reports.run import AtLeast, Case
 
 POLES = ("cart-pole", "rotary-pendulum")
@@ -14,8 +13,7 @@ UP = {"down_up_share": AtLeast(1.0), "uniform_up_share": AtLeast(1.0)}
 
 def small(plant: str, **numbers):
     """Settings of a fit for a quick run."""
-    fit = FITS[plant]
-    return fit._replace(widths=(24, 24), numbers=fit.numbers._replace(starts=128, **numbers))
+    return {"fit": published.FITS[plant]._replace(starts=128, **numbers), "widths": (24, 24), "seeds": 1}
 
 
 CASES = (
@@ -90,7 +88,7 @@ CASES = (
         "value/pendulum",
         values.pendulum,
         {},
-        {"fit": small("pendulum", iterations=4, seconds=1.0), "seeds": 1, "points": (41, 81)},
+        {**small("pendulum", iterations=4, seconds=1.0), "points": (41, 81)},
         published={"down_return": RETURNS["pendulum"]},
         bound={"down_return": AtLeast(-30.9), "median_relative_error": 1e-2, "grid_converged": AtLeast(1.0), **UP},
     ),
@@ -99,7 +97,7 @@ CASES = (
             f"value/{plant}",
             values.beside_shooting,
             {"plant": plant},
-            {"fit": small(plant, iterations=3, seconds=0.5, steps=50), "seeds": 1, "starts_around": 4, "iterations": 5},
+            {**small(plant, iterations=3, seconds=0.5, steps=50), "starts_around": 4, "iterations": 5},
             published={"down_return": RETURNS[plant]} if plant in RETURNS else {},
             bound={
                 "median_relative_error": 1e-2,

@@ -17,7 +17,6 @@ from dln_jax import joint_dissipation, tree_system
 from dln_jax.control.closed_loop import Hardware, following, outcomes
 from dln_jax.control.desktop_plants import desktop_plant, law_of, nominal_model
 from dln_jax.control.observers import with_differences
-from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.control.optimal.problem import hjb_policy
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.control.plants.mujoco_plants import simulate_in_mujoco
@@ -44,6 +43,7 @@ from dln_jax.models.trees import make_serial_tree
 from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.control import plans
 from scripts.reports.control.problems import Sizes, in_jax
+from scripts.reports.control.published import cart_pole_on_rail
 from scripts.reports.robots.arm import DAMPING, MIDDLE, STEP, STIFFNESS, D, Motion, arm, logs, measured, motion
 from scripts.reports.run import Numbers
 from scripts.reports.speed.exported_c import compiled, evicting, programs, random_network, timed
@@ -145,7 +145,7 @@ def tracking(
 
 def laws_in_c(*, repeats: int = 9, calls: int = 1000, cold: int = 1000) -> Numbers:
     """Times of a call of laws as C: medians of warm calls, and quantiles of cold ones after reading 32 MiB or more."""
-    desk, problem = desktop_plant("rotary-pendulum"), PLANTS["cart-pole"]().problem
+    desk, problem = desktop_plant("rotary-pendulum"), cart_pole_on_rail().problem
     swing_up, joints = law_of(desk, nominal_model(desk)), desk.scene.needs.joints
     tree, network = dynamics(tree_system(arm(coulomb=False).tree)), value_network(problem, widths=(64, 64), scale=30.0)
     parameters = network.init(jax.random.key(0))

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control.conditions import constraints
+from dln_jax.control.constraints import rows_of, stacked
 from dln_jax.control.real_time import feedback, improve, prepare
 from dln_jax.control.shooting import Shooting, shoot
 from dln_jax.control.state_space import integrated
@@ -59,10 +59,11 @@ OPTIONS = {
 def residual(problem: TrajectoryProblem, solution: Shooting) -> Array:
     """Largest residual of the conditions of an optimum, relative to the multipliers, from one Lagrangian of all."""
     x, u = solution.plan.x, solution.plan.u
-    step_rows, end_rows, _ = constraints(problem, x.shape[1], u.shape[1])
+    of_steps, of_end = rows_of(problem, x.shape[1], u.shape[1])
+    step_rows, end_rows = stacked(of_steps), stacked([one for one in of_end if one.kind != "equation"])
 
     def rows(x, u):
-        return jnp.append(jax.vmap(step_rows)(x[:-1], u).ravel(), end_rows(x[-1]))
+        return jnp.append(jax.vmap(step_rows)(x[:-1], u).ravel(), end_rows(x[-1], None))
 
     def lagrangian(x, u):
         cost = jnp.sum(jax.vmap(problem.cost)(x[:-1], u)) + problem.final_cost(x[-1])

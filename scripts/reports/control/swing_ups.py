@@ -34,7 +34,7 @@ from dln_jax.control.desktop_plants import (
 from dln_jax.control.estimate.tuning import from_log
 from dln_jax.control.plants.estimators import by_differences, by_filter
 from dln_jax.control.regulators import sampled_lqr
-from dln_jax.control.shooting import optimise
+from dln_jax.control.shooting import shoot
 from dln_jax.control.state_space import error, field_of, integrated, linearise, saturated
 from dln_jax.control.trajectories import Plan, TrajectoryProblem
 from dln_jax.mechanics.equations import dynamics
@@ -195,7 +195,8 @@ def plan_of(motor: Motor, guess, slope_weight: float) -> Plan:
     def final_cost(state):
         return jnp.array([300.0, 300.0, 30.0, 30.0, 3.0]) @ (state - jnp.append(jnp.asarray(GOAL), 0.0)) ** 2
 
-    return optimise(TrajectoryProblem(step, cost, final_cost), np.zeros(5), guess, iterations=300)
+    problem = TrajectoryProblem(step, cost, final_cost)
+    return shoot(problem, np.zeros(5), None, guess, method="single", iterations=300).plan
 
 
 def following(motor: Motor) -> Callable[[Plan], Controller]:

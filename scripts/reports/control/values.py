@@ -14,20 +14,25 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control.optimal.fitted import fit_values
-from dln_jax.control.optimal.flow import flow
-from dln_jax.control.optimal.grid import extrapolated, lookahead, solve_on_grid
-from dln_jax.control.optimal.grid_interpolation import interpolated
-from dln_jax.control.optimal.plants import FITS, PLANTS, ValuePlant, ValueSettings, evaluate, starts
-from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, circles, from_field, hjb_policy
+from dln_jax.control.optimal.fitted import Iteration, fit_values
+from dln_jax.control.optimal.grid import extrapolated, interpolated, lookahead, solve_on_grid
+from dln_jax.control.optimal.problem import (
+    ControlProblem,
+    ValueAndGradient,
+    circles,
+    flow,
+    from_field,
+    hjb_policy,
+    worst_disturbance,
+)
 from dln_jax.control.optimal.residual import fit_hjb
 from dln_jax.control.optimal.value_networks import value_network
-from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
 from dln_jax.control.regulators import lqr
-from dln_jax.control.shooting import optimise
+from dln_jax.control.shooting import shoot
 from dln_jax.control.state_space import Law
 from dln_jax.control.trajectories import TrajectoryProblem
 from dln_jax.types import Scalar
+from scripts.reports.control.published import FITS, PLANTS, SCALE, WIDTHS, ValuePlant, evaluate, starts
 from scripts.reports.run import Numbers
 
 LEAST = 1e-2
@@ -38,10 +43,12 @@ FACTORS = {"model": (1.0, 1.0), "heavy_and_long": (1.15, 1.15), "far": (1.3, 1.1
 """Factors on mass and length of the evaluated pendulums; the last lies beyond the trained range."""
 
 
-def trained(plant: ValuePlant, fit: ValueSettings, seeds: int) -> tuple[list[ValueAndGradient], list[float]]:
+def trained(
+    plant: ValuePlant, fit: Iteration, widths: tuple[int, ...], seeds: int
+) -> tuple[list[ValueAndGradient], list[float]]:
     """Values in float64 by fitted value iteration, one seed after the other, and training times, s."""
-    network = value_network(plant.problem, widths=fit.widths, scale=fit.scale)
-    fits = fit_values(plant.problem, network, range(seeds), numbers=fit.numbers)
+    network = value_network(plant.problem, widths=widths, scale=SCALE)
+    fits = fit_values(plant.problem, network, range(seeds), numbers=fit)
 
     def in_double(parameters):
         parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), parameters)
@@ -81,7 +88,11 @@ def compared(
 
 
 def pendulum(
-    *, fit: ValueSettings = FITS["pendulum"], seeds: int = 3, points: tuple[int, ...] = (101, 201, 401)
+    *,
+    fit: Iteration = FITS["pendulum"],
+    widths: tuple[int, ...] = WIDTHS,
+    seeds: int = 3,
+    points: tuple[int, ...] = (101, 201, 401),
 ) -> Numbers:
     """Compares the pendulum's value with a grid solution over the box, extrapolated from the two finest grids."""
     plant = PLANTS["pendulum"]()
@@ -97,7 +108,7 @@ def pendulum(
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     truth, by_grid = np.asarray(extrapolated(coarse, fine, nodes)), lookahead(problem, fine, limit=plant.limit)
     numbers = {
-        **compared(plant, *trained(plant, fit, seeds), nodes, truth),
+        **compared(plant, *trained(plant, fit, widths, seeds), nodes, truth),
         "grid_converged": float(fine.converged),
         "grid_median_relative_extrapolation": np.median(off_by(interpolated(fine.grid, fine.V, nodes), truth)),
         "grid_down_return": np.mean(evaluate(plant, by_grid, starts(plant, "down")).returns),
@@ -148,7 +159,8 @@ def direct_values(
             return move(x, u)[0], u
 
         guess = jax.lax.scan(follow, x, length=steps)[1]
-        plan = optimise(planned, jnp.append(x, 1.0), guess, iterations=iterations, tolerance=1e-7)
+        start = jnp.append(x, 1.0)
+        plan = shoot(planned, start, None, guess, method="single", iterations=iterations, tolerance=1e-7).plan
         return plan.cost - 0.5 * dt * problem.state_cost(x)
 
     # One guess after the other: a batch takes as long as its slowest member.
@@ -157,13 +169,19 @@ def direct_values(
 
 
 def beside_shooting(
-    *, plant: str, fit: ValueSettings | None = None, seeds: int = 3, starts_around: int = 100, iterations: int = 25
+    *,
+    plant: str,
+    fit: Iteration | None = None,
+    widths: tuple[int, ...] = WIDTHS,
+    seeds: int = 3,
+    starts_around: int = 100,
+    iterations: int = 25,
 ) -> Numbers:
     """Compares a value with direct optimisation from starts all around the circle."""
     described, fit = PLANTS[plant](), fit or FITS[plant]
-    values, seconds = trained(described, fit, seeds)
+    values, seconds = trained(described, fit, widths, seeds)
     x, laws = starts(described, "uniform", starts_around), [hjb_policy(value, described.problem) for value in values]
-    settings: Any = {"limit": described.limit, "dt": fit.numbers.dt, "iterations": iterations}
+    settings: Any = {"limit": described.limit, "dt": fit.dt, "iterations": iterations}
     truth = direct_values(described.problem, x, laws, **settings)
     return {f"value/{plant}": compared(described, values, seconds, x, truth)}
 
@@ -191,7 +209,7 @@ def equation(
     x, measured = starts(plant, "down", starts_down), {}
     network = value_network(plant.problem, widths=(width, width), scale=30.0)
     for name in ("trusting", "robust") if robust else ("",):
-        worst = worst_disturbance(rod, [1.0, 1.0], Bounds(parameters=0.15)) if name == "robust" else None
+        worst = worst_disturbance(rod, [1.0, 1.0], parameters=0.15) if name == "robust" else None
         effort: Any = {"samples": samples, "iterations": iterations, "disturbance": worst}
         effort |= {"rounds": 6} if robust else {}
         laws = []
@@ -201,8 +219,8 @@ def equation(
             fit = fit_hjb(plant.problem, network.value_and_gradient, start, of_samples, **effort)
             laws.append(hjb_policy(lambda x, fit=fit: network.value_and_gradient(fit.parameters, x), plant.problem))
         for where, factors in FACTORS.items() if robust else [("", FACTORS["model"])]:
-            moved = from_field(partial(rod, p=jnp.asarray(factors)), 1)
-            changed = plant._replace(problem=plant.problem._replace(**moved._asdict()))
+            drift, actuation = from_field(partial(rod, p=jnp.asarray(factors)), 1)
+            changed = plant._replace(problem=plant.problem._replace(drift=drift, actuation=actuation))
             runs = [evaluate(changed, law, x) for law in laws]
             returns, up = [np.mean(run.returns) for run in runs], [np.mean(np.isfinite(run.settled)) for run in runs]
             key = f"{name}_{where}_" if robust else "down_"

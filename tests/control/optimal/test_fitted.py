@@ -7,11 +7,16 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
-from dln_jax.control.optimal.fitted import Iteration, fit_value, fit_values
-from dln_jax.control.optimal.flow import drawn, flow, targets, widened
-from dln_jax.control.optimal.problem import ControlProblem, optimal_control
+from dln_jax.control.optimal.fitted import Iteration, fit_value, fit_values, targets
+from dln_jax.control.optimal.problem import (
+    ControlProblem,
+    drawn,
+    flow,
+    optimal_control,
+    widened,
+    worst_disturbance,
+)
 from dln_jax.control.optimal.value_networks import value_network
-from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
 from dln_jax.control.regulators import lqr
 
 PENDULUM = ControlProblem(
@@ -56,10 +61,10 @@ def test_targets_are_weighted_returns_and_their_slopes():
     found = jax.jit(lambda memory: targets(PENDULUM, value, x, steps=steps, dt=dt, memory=memory))
     expected = jax.jit(jax.value_and_grad(weighted_returns))
     for memory in (0.05, 1e9):
-        assert found(memory).V[0] == pytest.approx(float(expected(x, memory)[0]), rel=1e-12)
+        assert found(memory)[1][0] == pytest.approx(float(expected(x, memory)[0]), rel=1e-12)
     # With all of the memory the slope is that of the return.
-    assert_allclose(found(1e9).slope[0], expected(x, 1e9)[1], rtol=1e-7)
-    assert_allclose(found(0.05).x[0], x)
+    assert_allclose(found(1e9)[2][0], expected(x, 1e9)[1], rtol=1e-7)
+    assert_allclose(found(0.05)[0][0], x)
 
 
 def test_values_of_a_line_and_of_the_worst_of_lines_are_those_of_the_regulator():
@@ -67,7 +72,7 @@ def test_values_of_a_line_and_of_the_worst_of_lines_are_those_of_the_regulator()
     numbers = Iteration(iterations=25, starts=64, seconds=0.5, dt=0.025, steps=40, batch=64, kept=2, learning_rate=0.05)
     network = value_network(LINE, widths=())
     for share in (0.0, 0.2):
-        worst = worst_disturbance(lambda x, u, p: p * x + u, [1.0], Bounds(parameters=share)) if share else None
+        worst = worst_disturbance(lambda x, u, p: p * x + u, [1.0], parameters=share) if share else None
         found = fit_value(LINE, network, numbers=numbers, double=True, disturbance=worst)
         S = lqr([[0.9 + share]], [[1.0]], [[0.5]], [[0.5]]).S[0, 0]
         V, slope = network.value_and_gradient(found.parameters, jnp.array([1.5]))
@@ -79,9 +84,10 @@ def test_seeds_are_what_each_is_alone_also_after_an_interruption():
     network = value_network(LINE, widths=())
     numbers = Iteration(iterations=3, starts=8, seconds=0.1, steps=2, batch=8, kept=2)
     stored = []
-    both = fit_values(LINE, network, (0, 1), numbers=numbers, store=lambda seed, state: stored.append((seed, state)))
-    first = next(state for seed, state in stored if seed == 1)
-    (alone,) = fit_values(LINE, network, (1,), numbers=numbers, restore=lambda seed, state: first)
+    keep = lambda *stage: stored.append(stage)  # noqa: E731
+    both = fit_values(LINE, network, (0, 1), numbers=numbers, store=keep)
+    first = next(stage for seed, *stage in stored if seed == 1)
+    (alone,) = fit_values(LINE, network, (1,), numbers=numbers, restore=lambda seed, like: first)
     jax.tree.map(assert_array_equal, both[1].parameters, alone.parameters)
     assert [at.validation for at in both[1].history] == [at.validation for at in alone.history]
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(alone.parameters))

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from calls import one_line
 
+from dln_jax.commands.values.evaluation import anywhere, simulated
 from dln_jax.control.optimal.own_plants import own_plant, own_problem, own_settings
-from dln_jax.control.optimal.plants import evaluate, starts
 from dln_jax.control.plants.plant import layout
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.explicit import closed_form
@@ -50,11 +50,11 @@ def test_rod_has_the_scales_of_its_closed_form():
     short, long = of_rod(), of_rod(4.0, 10.0)
     assert short.scale == pytest.approx(np.sqrt(1.5 * 9.81), rel=1e-9)
     assert long.scale == pytest.approx(short.scale / 2, rel=1e-9)
-    numbers, slower = own_settings(short).numbers, own_settings(long).numbers
+    numbers, slower = own_settings(short)[0], own_settings(long)[0]
     for name in ("dt", "seconds", "memory"):
         assert getattr(slower, name) == pytest.approx(2 * getattr(numbers, name))
-    problem = own_plant(rod(), short).problem
-    assert own_plant(rod(4.0), long).problem.discount == pytest.approx(problem.discount / 2)
+    problem = own_plant(rod(), short)
+    assert own_plant(rod(4.0), long).discount == pytest.approx(problem.discount / 2)
     # Hanging costs π² / 2, half of the motor's limit a share of it.
     assert problem.state_cost(jnp.array([np.pi, 0.0])) == pytest.approx(0.5 * np.pi**2)  # driven
     assert problem.action_cost.cost(jnp.array([1.25])) == pytest.approx(0.25 * np.pi**2)
@@ -64,7 +64,7 @@ def test_rod_has_the_scales_of_its_closed_form():
 
 def test_barriers_rise_at_the_ends_of_the_rail():
     numbers = own_problem(dynamics(POLE.closed_form), RAIL)
-    problem = own_plant(dynamics(POLE.closed_form), numbers).problem
+    problem = own_plant(dynamics(POLE.closed_form), numbers)
     ends = np.array([problem.state_cost(jnp.array([s, 0, 0, 0])) for s in (-0.5, -0.3, 0.3, 0.5)])
     plain = numbers.weights[0] * np.array([0.25, 0.09, 0.09, 0.25])
     # The middle is at -0.1 m: the right end is 0.2 m nearer.
@@ -76,11 +76,11 @@ def test_barriers_rise_at_the_ends_of_the_rail():
 
 def test_a_limited_joint_is_no_circle_and_a_run_beyond_its_limits_fails():
     numbers = of_rod(position=[[-0.4, 3.5]])
-    plant = own_plant(rod(), numbers)
-    assert plant.problem.joints == ("prismatic",) and numbers.turning == (False,)
-    idle = evaluate(plant, lambda x: jnp.zeros(1), np.array([[0.1, 0.0], [-0.1, 0.0]]))
-    assert not np.isfinite(idle.settled).any()
-    inside = starts(plant, "uniform", 100)[:, 0]
+    problem = own_plant(rod(), numbers)
+    assert problem.joints == ("prismatic",) and numbers.turning == (False,)
+    _, settled = simulated(problem, numbers, lambda x: jnp.zeros(1), np.array([[0.1, 0.0], [-0.1, 0.0]]))
+    assert not np.isfinite(settled).any()
+    inside = anywhere(problem, numbers, 100)[:, 0]
     assert inside.min() >= -0.4 and inside.max() <= 3.5
 
 

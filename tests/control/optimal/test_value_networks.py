@@ -10,7 +10,6 @@ from numpy.testing import assert_allclose
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
 from dln_jax.control.optimal.problem import (
     ControlProblem,
-    at_goal,
     checked,
     from_plant,
     hjb_policy,
@@ -84,25 +83,6 @@ def test_the_equation_is_the_least_over_controls():
     u = optimal_control(PROBLEM, X, slope)
     assert hamiltonian(u) == pytest.approx(float(hjb_residual(PROBLEM, X, value, slope)))
     assert_allclose(jax.grad(hamiltonian)(u), 0, atol=1e-12)
-
-
-def test_another_goal_is_held_by_a_control():
-    weight = 2.0
-    push = limited_atan(5.0, 3.0)  # of a rod that stands at 0
-    drift = lambda x: jnp.stack([x[1], weight * jnp.sin(x[0])])  # noqa: E731
-    actuation = lambda x: jnp.array([[0.0], [1.0]])  # noqa: E731
-    box = -HIGH[1:3], HIGH[1:3]
-    rod = ControlProblem(drift, actuation, lambda x: x @ x, push, 0.0, *box, ("revolute",), np.zeros(2))
-    aside = at_goal(rod, [0.4, 0.0])
-    held = optimal_control(aside, jnp.asarray(aside.goal), jnp.zeros(2))
-    assert_allclose(held, -weight * np.sin(0.4), rtol=1e-12)
-    for problem, goal, message in (
-        (rod._replace(action_cost=limited_atan(0.5, 0.3)), [0.4, 0.0], "limits cannot hold the goal"),
-        (rod, [0.4, 1.0], "not an equilibrium"),
-        (rod, [0.4], "shape"),
-    ):
-        with one_line(message):
-            at_goal(problem, goal)
 
 
 def test_problems_and_networks_that_contradict_themselves_are_refused():

@@ -6,11 +6,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from dln_jax import dynamics
-from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.control.optimal.problem import rates
 from dln_jax.control.state_space import field_of
 from dln_jax.scenes.pendulums import cart_pole
-from scripts.reports.control import plants, problems, values
+from scripts.reports.control import plants, problems, published, values
 
 
 def test_cart_pole_is_that_of_the_scenes():
@@ -65,5 +64,5 @@ def test_late_pendulum_follows_ten_milliseconds_after_and_loses_energy_by_fricti
 
 
 def test_worst_disturbance_moves_the_published_pendulum():
-    problem, x, u = PLANTS["pendulum"]().problem, jnp.array([0.3, -1.0]), jnp.array([0.8])
+    problem, x, u = published.pendulum().problem, jnp.array([0.3, -1.0]), jnp.array([0.8])
     assert_allclose(values.rod(x, u, jnp.ones(2)), rates(problem)(x, u), rtol=1e-12)

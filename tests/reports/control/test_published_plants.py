@@ -1,12 +1,15 @@
-"""The published plants are as printed."""
+"""The published plants are as printed, and the library's files of the same names move alike."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control.optimal.plants import PLANTS, evaluate, starts
-from dln_jax.control.optimal.problem import checked, rates
+from dln_jax.commands.values import plants
+from dln_jax.control.optimal.own_plants import FILES
+from dln_jax.control.optimal.problem import rates
+from dln_jax.zoo.value_functions import plant_of_model
+from scripts.reports.control.published import PLANTS, evaluate, starts
 
 
 def test_the_pendulum_as_printed():
@@ -33,14 +36,14 @@ def test_the_cart_pole_as_printed():
 
 
 @pytest.mark.parametrize("name", PLANTS)
-def test_plants_are_problems_in_both_precisions(name):
-    problem = PLANTS[name]().problem
-    if name == "cart-pole":
-        checked(problem)
-    with jax.enable_x64(False):
-        x = jnp.asarray(problem.goal, float)
-        rate, cost = jax.eval_shape(lambda x: (rates(problem)(x, jnp.zeros(1)), problem.state_cost(x)), x)
-        assert rate.dtype == jnp.float32 == cost.dtype
+def test_files_have_the_published_dynamics(name):
+    pytest.importorskip("mujoco", reason="MuJoCo reads the files; it is in the extra [robot]")
+    run, known, _ = plants.of_file(FILES[name])
+    of_file = plant_of_model(run.model, run.parameters, plants.problem_of(run, known))
+    x, u = jnp.array([0.3, 2.0, -1.5, 4.0])[-2 * len(known.joints) :], 0.7 * known.limits.control[:, 1]
+    published = PLANTS[name]()
+    assert known.limits.control[0, 1] == published.limit
+    np.testing.assert_allclose(rates(of_file)(x, u), rates(published.problem)(x, u), rtol=1e-9)
 
 
 def test_returns_of_rest_and_of_a_law_that_fails():
