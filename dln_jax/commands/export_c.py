@@ -33,8 +33,6 @@ class Arguments:
     """Newton steps of the implicit midpoint rule."""
     temperature: Unstated[float] = None
     """Temperature of the C functions, °C, if friction depends on it (default: the reference of the identification)."""
-    libm: bool = False
-    """Call the C library's exp, expm1, tanh, sin, cos, log and log1p instead of vectorisable ones."""
     casadi: bool = False
     """Add NAME_casadi.c: the functions with exact derivatives for CasADi's external and for acados."""
     finite: bool = False

@@ -25,7 +25,7 @@ _BOXES = 6
 
 def unrolled(body: Body, node: Node) -> set[Node]:
     """Writes a scalar as an expression of variables and of the scalars fused into it; returns the nodes written."""
-    if node in body.plan.beside and not body.source.libm:
+    if node in body.plan.beside:
         pair = sorted((node, body.plan.beside[node]), key=lambda scalar: scalar.op, reverse=True)
         body.source.functions.add("sin_cos")
         body.spend(sin=1)
@@ -59,7 +59,7 @@ def _expression(body: Body, node: Node, args: list[str], *, looped: bool = False
     operation = OPERATIONS[node.op]
     if node.dtype == "real" or node.args[0].dtype == "real":
         body.spend(**{node.op: 1})
-    if operation.function in VECTORISED and not body.source.libm:
+    if operation.function in VECTORISED:
         body.source.functions.add(node.op)
         return f"elementary_{node.op}({args[0]})"
     if looped and node.dtype == "real" and node.op in _CHOICES:
@@ -100,7 +100,7 @@ def looped(body: Body, node: Node) -> None:
             if arg not in inside:
                 where[arg] = index if arg.size == node.size else np.zeros_like(index)
     target = body.kept(node)
-    if node.op in VECTORISED and not body.source.libm:
+    if node.op in VECTORISED:
         body.spend(**{node.op: node.size})
         body.source.arrays.add(node.op)
         body.line(f"elementary_{node.op}_each({node.size}, {body.name(node.args[0])}, {target});")

@@ -24,7 +24,6 @@ def export_run(
     precision: str | None = None,
     iterations: int = ITERATIONS,
     temperature: float | None = None,
-    libm: bool = False,
     casadi: bool = False,
     finite: bool = False,
     overwrite: bool = False,
@@ -39,7 +38,7 @@ def export_run(
         iterations: Newton steps of the implicit midpoint rule.
         temperature: temperature of the C functions in °C, for a robot whose friction depends on it; default: the
             reference temperature of its identification.
-        libm, casadi, finite, overwrite: as for `export_c`.
+        casadi, finite, overwrite: as for `export_c`.
 
     Raises:
         InputError: no run in the folder, an unknown or refused function, or a model independent of temperature.
@@ -56,6 +55,6 @@ def export_run(
     # NAME_casadi.c contains first and second derivatives of its functions.
     itself = casadi if functions else casadi and [function for function in chosen if not function.endswith(DERIVATIVES)]
     return export_c(
-        chosen, directory, name=name, precision=precision, libm=libm, casadi=itself, overwrite=overwrite,
+        chosen, directory, name=name, precision=precision, casadi=itself, overwrite=overwrite,
         finite=finite, leave_out_large=functions is None,
     )  # fmt: skip

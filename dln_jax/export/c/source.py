@@ -55,7 +55,6 @@ def export_c(
     *,
     name: str = "model",
     precision: str | None = None,
-    libm: bool = False,
     casadi: bool | Collection[str] = False,
     leave_out_large: bool = False,
     stack: int = STACK,
@@ -72,7 +71,6 @@ def export_c(
         directory: folder of the export; created if missing.
         name: a C name; every file and public function starts with it.
         precision: f32 or f64, for all real numbers; default: the precision of the examples.
-        libm: call the C library's exp, expm1, tanh, sin, cos, log and log1p instead of vectorisable ones.
         casadi: also write NAME_casadi.c: all functions, or those named, with exact derivatives for CasADi's `external`.
         leave_out_large: omit functions that exceed the stack or 4,000 lines (which take seconds to compile), and from
             NAME_casadi.c functions that CasADi cannot take; the files list the omitted functions.
@@ -88,7 +86,7 @@ def export_c(
             MB, files exist, or the folder belongs to a run, whose files are never replaced.
     """
     texts = source_files(
-        functions, name=check_name(name), precision=precision, libm=libm, casadi=casadi,
+        functions, name=check_name(name), precision=precision, casadi=casadi,
         leave_out_large=leave_out_large, stack=stack, finite=finite, loop_bound=loop_bound,
     )  # fmt: skip
     return write_exports(Path(directory), texts, overwrite=overwrite)
@@ -99,7 +97,6 @@ def source_files(
     *,
     name: str,
     precision: str | None = None,
-    libm: bool = False,
     casadi: bool | Collection[str] = False,
     leave_out_large: bool = False,
     stack: int = STACK,
@@ -121,7 +118,7 @@ def source_files(
         raise InputError(f"precision is {precision!r}; expected f32 or f64")
     with computing_in(precision):
         source, signatures, texts, left_out = _exported(
-            functions, Source(precision, libm, finite, loop_bound), name, leave_out_large, stack
+            functions, Source(precision, finite, loop_bound), name, leave_out_large, stack
         )
         version = importlib.metadata.version("dln-jax")
         written_by = f"Written by dln-jax {version}, C format {FORMAT}."
@@ -137,7 +134,7 @@ def source_files(
                 raise InputError("CasADi computes in double; export with precision f64")
             chosen = {key: functions[key] for key in signatures if casadi is True or key in casadi}
             source, text, left_out = external.external_functions(
-                name, chosen, Source("f64", libm, finite, loop_bound), stack=stack, leave_out=leave_out_large
+                name, chosen, Source("f64", finite, loop_bound), stack=stack, leave_out=leave_out_large
             )
             title = about(CASADI_ABOUT.format(name=name, written_by=written_by), left_out=left_out)
             files[f"{name}_casadi.c"] = title + preamble(source, name) + text

@@ -12,7 +12,8 @@ _PROMISES = """Functions of one state. Their workspace is on the stack, so they 
 Results may overlap arguments, as updates in place do, but not each other: all arguments are read before results are
 written. NaN and infinities in a state propagate to the results."""
 NEEDED = """C99; needs <math.h>, <float.h> and <stdint.h>, and nothing else. Fastest with -O3 for the processor at hand
-(gcc: -march=native); does not compile with -ffast-math, which gives wrong numbers."""
+(gcc: -march=native) and -DDLN_OWN_ELEMENTARY, which replaces the C library's exp, tanh, sin and others by functions
+that vectorise; does not compile with -ffast-math, which gives wrong numbers."""
 _PREAMBLE = """\
 #include <float.h>
 #include <math.h>
@@ -151,7 +152,7 @@ def demo(name: str, functions: Mapping[str, Signature], precision: str) -> str:
     kinds = {**KINDS, "real": real}
     text = comment(
         f"{name}_demo.c: prints the results of the functions of {name}.h at one state.",
-        f"cc -std=c99 -O3 -march=native {name}.c {name}_demo.c -lm -o {name}_demo\n"
+        f"cc -std=c99 -O3 -march=native -DDLN_OWN_ELEMENTARY {name}.c {name}_demo.c -lm -o {name}_demo\n"
         f"./{name}_demo 1000000    also times a million calls of each",
     ) + _START.format(name=name, real=real)
     for key, function in functions.items():
@@ -185,6 +186,13 @@ project({name} C)
 
 if(NOT CMAKE_BUILD_TYPE)
   set(CMAKE_BUILD_TYPE Release)
+endif()
+
+# Functions that vectorise in place of the C library's exp, tanh, sin and others. They pay with the vector instructions
+# of the processor at hand (-DCMAKE_C_FLAGS=-march=native), and are slower than the library's without them.
+option(DLN_OWN_ELEMENTARY "Use the model's own exp, tanh, sin and others" OFF)
+if(DLN_OWN_ELEMENTARY)
+  add_definitions(-DDLN_OWN_ELEMENTARY)
 endif()
 
 add_library({name} {name}.c)

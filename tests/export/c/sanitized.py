@@ -13,7 +13,7 @@ from dln_jax.export.c.source import export_c
 from dln_jax.export.c.text import NUMPY_TYPES
 
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-FLAGS = ("-std=c99", "-pedantic", *STRICT, "-g", "-O1", *SANITIZERS)
+FLAGS = ("-std=c99", "-pedantic", *STRICT, "-g", "-O1", "-DDLN_OWN_ELEMENTARY", *SANITIZERS)
 
 
 def in_sanitized_c(functions, states, folder, **options):

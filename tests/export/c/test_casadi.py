@@ -141,7 +141,7 @@ def test_what_casadi_cannot_take_is_refused(tmp_path):
             export_c({"f": (function, examples)}, tmp_path / "c", casadi=True, **keywords)
     assert not (tmp_path / "c").exists()
     with one_line(r"^casadi_m_f: it would take 4 KiB of stack; .* up to 2 KiB; export it without casadi$"):
-        external_c.external_functions("m", {"f": (jnp.tanh, [np.ones(500)])}, Source("f64", libm=True), stack=2048)
+        external_c.external_functions("m", {"f": (jnp.tanh, [np.ones(500)])}, Source("f64"), stack=2048)
 
 
 def test_what_casadi_cannot_take_is_left_out_where_it_may_be(tmp_path):

@@ -98,7 +98,7 @@ def test_the_demo_is_clean_under_the_sanitizers(tmp_path):
 
 @needs_compiler
 def test_an_object_has_no_state_and_needs_libm_only(folder, tmp_path):
-    compile_c(["-O1", "-c", str(folder / "model.c"), "-o", str(tmp_path / "model.o")])
+    compile_c(["-O1", "-DDLN_OWN_ELEMENTARY", "-c", str(folder / "model.c"), "-o", str(tmp_path / "model.o")])
     nm = subprocess.run(["nm", tmp_path / "model.o"], capture_output=True, text=True, check=True).stdout
     sorts = {line.split()[-1]: line.split()[-2] for line in nm.splitlines()}
     # Text, and constants: no data that can change.
@@ -111,13 +111,14 @@ def test_an_object_has_no_state_and_needs_libm_only(folder, tmp_path):
 @needs_compiler
 @pytest.mark.skipif(not shutil.which("g++"), reason="there is no C++ compiler on the PATH")
 def test_the_source_is_cpp_too(folder):
-    compile_c(["-pedantic", *STRICT, "-fsyntax-only", "-x", "c++", str(folder / "model.c")], "g++")
+    compile_c(
+        ["-pedantic", *STRICT, "-DDLN_OWN_ELEMENTARY", "-fsyntax-only", "-x", "c++", str(folder / "model.c")], "g++"
+    )
 
 
 @needs_x86
-def test_the_library_may_have_its_own_elementary_functions_which_bear_extended_precision(tmp_path):
-    export_c({"network": FUNCTIONS["network"]}, tmp_path, libm=True)
-    assert "elementary_tanh" not in (tmp_path / "model.c").read_text()
+def test_functions_of_the_c_library_bear_extended_precision(tmp_path):
+    export_c({"network": FUNCTIONS["network"]}, tmp_path)
     x = np.linspace(-1, 1, 33)
     loaded = load_c(tmp_path, compiler="gcc", flags=("-O0", *STRICT, "-mfpmath=387"))
     np.testing.assert_allclose(loaded.network(x), np.tanh(x @ W), rtol=1e-12)
@@ -130,7 +131,7 @@ def test_cmake_builds_library_and_demo(tmp_path):
     # One folder per export: a second one would need a CMake file of its own.
     with pytest.raises(InputError, match=r"holds CMakeLists\.txt already"):
         export_c(FUNCTIONS, tmp_path, name="other")
-    for arguments in (["-S", ".", "-B", "build"], ["--build", "build"]):
+    for arguments in (["-S", ".", "-B", "build", "-DDLN_OWN_ELEMENTARY=ON"], ["--build", "build"]):
         subprocess.run(["cmake", *arguments], cwd=tmp_path, check=True, capture_output=True)
     assert "x_next" in subprocess.run([tmp_path / "build" / "swing_demo"], capture_output=True, text=True).stdout
 
@@ -248,9 +249,9 @@ def test_no_field_of_a_description_is_believed(exported, tmp_path):
 
 @needs_x86
 def test_flags_that_give_wrong_numbers_do_not_compile(folder):
-    for flag in ("-ffast-math", "-ffinite-math-only", "-mfpmath=387"):
+    for flag in ("-ffast-math", "-ffinite-math-only", "-mfpmath=387 -DDLN_OWN_ELEMENTARY"):
         with pytest.raises(InputError, match=r"#error .*(-ffast-math|-mfpmath=sse)"):
-            load_c(folder, compiler="gcc", flags=(flag,))
+            load_c(folder, compiler="gcc", flags=flag.split())
 
 
 def test_an_export_never_takes_the_place_of_a_runs_file(tmp_path):
