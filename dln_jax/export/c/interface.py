@@ -28,6 +28,11 @@ class Leaf(NamedTuple):
     kind: str
     shape: tuple[int, ...]
 
+    @property
+    def described(self) -> str:
+        """Name and shape, for messages and comments."""
+        return f"{self.name} {list(self.shape)}" if self.shape else self.name
+
 
 class Cost(NamedTuple):
     """Upper bounds on what one call of a C function takes."""
@@ -58,6 +63,11 @@ class Signature(NamedTuple):
     def returns(self) -> bool:
         """Whether the function returns its only result, a scalar, instead of writing to an array."""
         return len(self.results) == 1 and self.results[0].shape == ()
+
+    @property
+    def written(self) -> tuple[Leaf, ...]:
+        """Results that the function writes to arrays."""
+        return () if self.returns else self.results
 
 
 def argument_leaves(function: Callable[..., Any], examples: Sequence[Any]) -> list[Leaf]:
@@ -106,7 +116,7 @@ def _checked(leaves: list[Leaf], what: str) -> list[Leaf]:
 
 def declaration(name: str, function: str, signature: Signature, real: str) -> str:
     """Returns the prototype of a function, without the semicolon."""
-    kinds, returned = {**KINDS, "real": real}, "void"
+    kinds = {**KINDS, "real": real}
 
     def array(leaf: Leaf) -> str:
         return f"{kinds[leaf.kind]} {leaf.name}[{max(prod(leaf.shape), 1)}]"  # C has no empty arrays
@@ -114,10 +124,8 @@ def declaration(name: str, function: str, signature: Signature, real: str) -> st
     parameters = [
         f"const {array(leaf)}" if leaf.shape else f"{kinds[leaf.kind]} {leaf.name}" for leaf in signature.arguments
     ]
-    if signature.returns:
-        returned = kinds[signature.results[0].kind]
-    else:
-        parameters += map(array, signature.results)
+    returned = kinds[signature.results[0].kind] if signature.returns else "void"
+    parameters += map(array, signature.written)
     return f"{returned} {name}_{function}({', '.join(parameters) or 'void'})"
 
 

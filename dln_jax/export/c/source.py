@@ -211,7 +211,7 @@ def _function(
 ) -> tuple[Signature, str, int]:
     """Returns the signature with costs, the C text, and the number of lines of a function, including callees."""
     named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(signature.arguments)}
-    targets = [] if signature.returns else [leaf.name for leaf in signature.results]
+    targets = [leaf.name for leaf in signature.written]
     try:
         program, _, results = program_of(closed, repeated, precision=source.precision, finite=source.finite)
         body = body_of(source, program, results, named, targets)
@@ -222,7 +222,7 @@ def _function(
             f"{key} would take {body.stack / 1024:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB"
         )
     words = set(re.findall(r"\w+", "\n".join(body.lines)))
-    leaves = [*signature.arguments, *(() if signature.returns else signature.results)]
+    leaves = [*signature.arguments, *signature.written]
     lines = "\n".join([*(f"    (void){leaf.name};" for leaf in leaves if leaf.name not in words), *body.lines])
     text = f"\n{declaration(name, key, signature, 'real')}\n{{\n{lines}\n}}\n"
     total = len(body.lines) + sum(source.parts[part].text.count("\n") for part in body.calls)

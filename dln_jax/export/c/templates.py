@@ -228,10 +228,10 @@ def header(
     """Returns the header: the prototype of every function, the shapes of its results and its cost."""
     declared = ""
     for key, signature in signatures.items():
-        shapes = "".join(f"{leaf.name} {list(leaf.shape)}, " for leaf in signature.results if leaf.shape)
+        shapes = ", ".join(leaf.described for leaf in signature.results if leaf.shape)
         facts = stated(signature.cost)
         prototype = declaration(name, key, signature, PRECISIONS[precision][1])
-        declared += f"\n/* {f'{shapes[:-2]}; ' if shapes else ''}{facts} */\n{prototype};\n"
+        declared += f"\n/* {f'{shapes}; ' if shapes else ''}{facts} */\n{prototype};\n"
     text = about(f"{name}.h", written_by, _PROMISES, left_out=left_out)
     return text + fill(_HEADER, precision, guard=f"{name.upper()}_H", declared=declared)
 
