@@ -9,6 +9,7 @@ import importlib.metadata
 import re
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +19,13 @@ import numpy as np
 from dln_jax.export.c import casadi as external
 from dln_jax.export.c.body import Source
 from dln_jax.export.c.emit import body_of
-from dln_jax.export.c.interface import (
-    FORMAT,
-    Signature,
-    argument_leaves,
-    array_of,
-    declaration,
-    description,
-    result_leaves,
-)
+from dln_jax.export.c.interface import FORMAT, Signature, argument_leaves, declaration, description, result_leaves
 from dln_jax.export.c.jaxprs import repeated_calls, traced
 from dln_jax.export.c.lowering import program_of
 from dln_jax.export.c.templates import CASADI_ABOUT, CASADI_BUILD, NEEDED, about, cmake, demo, header, preamble
 from dln_jax.export.c.text import PRECISIONS, check_name, comment, kind_of
-from dln_jax.export.exports import write_exports
-from dln_jax.precision import computing_in
+from dln_jax.files import read_json, write_bytes
+from dln_jax.precision import computing_in, require_precision
 from dln_jax.types import InputError, require_positive
 
 Functions = Mapping[str, tuple[Callable[..., Any], Sequence[Any]]]
@@ -85,43 +78,48 @@ def export_c(
         InputError: a function cannot be written in C or needs more stack, a name is invalid in C, the source exceeds 10
             MB, files exist, or the folder belongs to a run, whose files are never replaced.
     """
-    texts = source_files(
-        functions, name=check_name(name), precision=precision, casadi=casadi,
-        leave_out_large=leave_out_large, stack=stack, finite=finite, loop_bound=loop_bound,
-    )  # fmt: skip
-    return write_exports(Path(directory), texts, overwrite=overwrite)
-
-
-def source_files(
-    functions: Functions,
-    *,
-    name: str,
-    precision: str | None = None,
-    casadi: bool | Collection[str] = False,
-    leave_out_large: bool = False,
-    stack: int = STACK,
-    finite: bool = False,
-    loop_bound: int | None = None,
-) -> dict[str, bytes]:
-    """Returns the contents of the files by name; arguments as for `export_c`."""
     require_positive(stack=stack, loop_bound=1 if loop_bound is None else loop_bound)
+    check_name(name)
     if not functions:
         raise InputError("there is no function to export; give at least one, as {'name': (function, examples)}")
+    chosen: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {}
     for key, pair in functions.items():
         if not (isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[1], tuple | list)):
             raise InputError(
                 f"{key} is {pair!r:.60}; expected (function, examples), one example for each argument: (f, (x,))"
             )
-    functions = {key: (_in_written_order(function), examples) for key, (function, examples) in functions.items()}
-    precision = precision or _precision(functions)
-    if precision not in PRECISIONS:
-        raise InputError(f"precision is {precision!r}; expected f32 or f64")
+        chosen[check_name(key, "the name of a function")] = (
+            _in_written_order(pair[0]), jax.tree.map(_array, tuple(pair[1]))
+        )  # fmt: skip
+    if precision is None:
+        types = [leaf.dtype for leaf in jax.tree.leaves([examples for _, examples in chosen.values()])]
+        sizes = [dtype.itemsize for dtype in types if jax.numpy.issubdtype(dtype, np.floating)]
+        precision = "f64" if max(sizes, default=8) == 8 else "f32"
+    require_precision(precision)
+    if casadi and precision != "f64":
+        raise InputError("CasADi computes in double; export with precision f64")
+    version = importlib.metadata.version("dln-jax")
+    written_by = f"Written by dln-jax {version}, C format {FORMAT}."
+    empty = Source(precision, finite, loop_bound)
+    source = empty.copy()
+    signatures: dict[str, Signature] = {}
+    texts, left_out = [], []
     with computing_in(precision):
-        source, signatures, texts, left_out = _exported(
-            functions, Source(precision, finite, loop_bound), name, leave_out_large, stack
-        )
-        version = importlib.metadata.version("dln-jax")
-        written_by = f"Written by dln-jax {version}, C format {FORMAT}."
+        every = {key: _traced(key, *pair, precision) for key, pair in chosen.items()}
+        repeated = repeated_calls([closed for _, closed in every.values()])
+        for key, (signature, closed) in every.items():
+            with_function = source.copy()
+            try:
+                signature, text, lines = _function(with_function, name, key, signature, closed, repeated, stack)
+                if leave_out_large and lines > LINES:
+                    raise TooLargeError(f"{key}, of {lines} lines")
+            except TooLargeError as error:
+                if not leave_out_large:
+                    raise
+                left_out.append(f"{error}; ask for it by name.")
+                continue
+            source, signatures[key] = with_function, signature
+            texts.append(text)
         parts = dict.fromkeys(part.text for part in source.parts.values())
         files = {
             f"{name}.h": header(name, written_by, signatures, precision, left_out),
@@ -130,11 +128,9 @@ def source_files(
             "CMakeLists.txt": cmake(name),
         }
         if casadi:
-            if precision != "f64":
-                raise InputError("CasADi computes in double; export with precision f64")
-            chosen = {key: functions[key] for key in signatures if casadi is True or key in casadi}
+            of_casadi = {key: chosen[key] for key in signatures if casadi is True or key in casadi}
             source, text, left_out = external.external_functions(
-                name, chosen, Source("f64", finite, loop_bound), stack=stack, leave_out=leave_out_large
+                name, of_casadi, empty, stack=stack, leave_out=leave_out_large
             )
             title = about(CASADI_ABOUT.format(name=name, written_by=written_by), left_out=left_out)
             files[f"{name}_casadi.c"] = title + preamble(source, name) + text
@@ -142,7 +138,15 @@ def source_files(
     if (longest := max(map(len, files.values()))) > LENGTH:
         raise InputError(f"the source would take {longest / 1e6:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")
     encoded = {file_name: text.encode() for file_name, text in files.items()}
-    return {**encoded, f"{name}.json": description(name, precision, version, signatures, encoded)}
+    stated = description(name, precision, version, signatures, encoded[f"{name}.h"], encoded[f"{name}.c"])
+    return _write(Path(directory), {**encoded, f"{name}.json": stated}, overwrite=overwrite)
+
+
+def _array(leaf: Any) -> Any:
+    """Returns an array, a number as an array, or zeros for a shape."""
+    if isinstance(leaf, jax.ShapeDtypeStruct):
+        return np.zeros(leaf.shape, leaf.dtype)
+    return leaf if hasattr(leaf, "dtype") else np.asarray(leaf)
 
 
 def _in_written_order(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -158,47 +162,11 @@ def _in_written_order(function: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def _precision(functions: Functions) -> str:
-    types = [array_of(leaf).dtype for leaf in jax.tree.leaves([examples for _, examples in functions.values()])]
-    sizes = {dtype.itemsize for dtype in types if jax.numpy.issubdtype(dtype, np.floating)}
-    return "f64" if max(sizes, default=8) == 8 else "f32"
-
-
-def _exported(
-    functions: Functions, source: Source, name: str, leave_out_large: bool, stack: int
-) -> tuple[Source, dict[str, Signature], list[str], list[str]]:
-    """Returns the source, signatures and texts of the functions, and reasons for those left out."""
-    signatures, texts, left_out = {}, [], []
-    every = {
-        check_name(key, "the name of a function"): _traced(key, *pair, source.precision)
-        for key, pair in functions.items()
-    }
-    repeated = repeated_calls([closed for _, closed in every.values()])
-    for key, (signature, closed) in every.items():
-        with_function = source.copy()
-        try:
-            signature, text, lines = _function(with_function, name, key, signature, closed, repeated, stack)
-            if leave_out_large and lines > LINES:
-                raise TooLargeError(f"{key}, of {lines} lines")
-        except TooLargeError as error:
-            if not leave_out_large:
-                raise
-            left_out.append(f"{error}; ask for it by name.")
-            continue
-        source, signatures[key] = with_function, signature
-        texts.append(text)
-    return source, signatures, texts, left_out
-
-
-def _traced(key: str, function: Callable[..., Any], examples: Sequence[Any], precision: str) -> tuple[Signature, Any]:
+def _traced(key: str, function: Callable[..., Any], examples: Any, precision: str) -> tuple[Signature, Any]:
     """Returns the signature, without costs, and the closed jaxpr of a function."""
-
-    def cast(leaf: Any) -> np.ndarray:
-        array = array_of(leaf)
-        return np.asarray(array, PRECISIONS[precision][0] if kind_of(array.dtype) == "real" else None)
-
+    real = PRECISIONS[precision][0]
     try:
-        examples = jax.tree.map(cast, tuple(examples))
+        examples = jax.tree.map(lambda x: np.asarray(x, real if kind_of(x.dtype) == "real" else None), examples)
         arguments = argument_leaves(function, examples)
         closed, shapes = traced(function, examples)
         return Signature(tuple(arguments), tuple(result_leaves(shapes, arguments))), closed
@@ -227,3 +195,29 @@ def _function(
     text = f"\n{declaration(name, key, signature, 'real')}\n{{\n{lines}\n}}\n"
     total = len(body.lines) + sum(source.parts[part].text.count("\n") for part in body.calls)
     return signature._replace(cost=body.cost), text, total
+
+
+def _write(directory: Path, files: Mapping[str, bytes], *, overwrite: bool) -> list[Path]:
+    """Writes the files, the description last: an interrupted export differs from its digest, which `load_c` refuses."""
+    for path in directory.glob("*.json"):
+        stated: Mapping[str, Any] = {}
+        with suppress(InputError):
+            stated = read_json(path, remedy="")
+        if "tensor_file" in stated:
+            raise InputError(f"{directory} is the folder of a run; export to another, such as {directory / 'exported'}")
+        if path.name in files and "functions" not in stated:
+            raise InputError(f"{path} describes no export; choose another folder or name")
+    existing = [directory / name for name in files if (directory / name).exists()]
+    for path in existing:
+        if not path.is_file():
+            raise InputError(f"{path} is not a file and cannot be replaced; choose another folder or name")
+    if existing and not overwrite:
+        names = ", ".join(path.name for path in existing)
+        raise InputError(f"{directory} holds {names} already; choose another folder or overwrite them")
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{directory}: cannot write there ({error.strerror}); choose another folder") from error
+    for name, content in files.items():
+        write_bytes(directory / name, content)
+    return [directory / name for name in files]

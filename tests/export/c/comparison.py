@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+import tempfile
 
 import jax
 import numpy as np
@@ -49,6 +50,12 @@ def in_c(functions, states, folder, *, precision="f64", flags=("-O1",), **option
         rows = [row if isinstance(row, tuple) else (row,) for row in rows]
         results[name] = [np.stack([np.asarray(result) for result in column]) for column in zip(*rows, strict=True)]
     return results
+
+
+def files_of(functions, name="model", **options):
+    """The contents of an export's files, by name."""
+    with tempfile.TemporaryDirectory() as folder:
+        return {path.name: path.read_bytes() for path in export_c(functions, folder, name=name, **options)}
 
 
 def in_order(tree):
