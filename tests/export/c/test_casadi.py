@@ -14,9 +14,9 @@ from comparison import STRICT, in_order, needs_compiler
 
 from dln_jax.export.c import casadi as external_c
 from dln_jax.export.c.body import Source
-from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import compile_c
 from dln_jax.export.c.source import export_c
+from dln_jax.export.functions import functions_of_system
 from dln_jax.scenes.pendulums import pendulum
 
 casadi = pytest.importorskip("casadi", reason="the functions are compared in CasADi, of the extra [test]")

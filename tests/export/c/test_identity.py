@@ -9,9 +9,9 @@ import pytest
 from comparison import files_of, needs_compiler
 
 from dln_jax.export.c import jaxprs
-from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
+from dln_jax.export.functions import functions_of_system
 from dln_jax.scenes.pendulums import chain
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from comparison import files_of, in_c, in_jax, needs_compiler
 from jax import lax
 
-from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
+from dln_jax.export.functions import functions_of_system
 from dln_jax.scenes.pendulums import pendulum
 
 BOUND = 1e-12

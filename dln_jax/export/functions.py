@@ -1,0 +1,269 @@
+"""The functions exported from a run or a system: pure functions of one state, with example arguments.
+
+For a system with forces, in coordinates and velocities, x = (q, qd):
+
+| name | arguments | results |
+|---|---|---|
+| `inverse_dynamics` | q, qd, qdd | tau |
+| `forward_dynamics` | q, qd, tau | qdd |
+| `energy` | q, qd | energy |
+| `mass_matrix` | q, and qd where M depends on it | M |
+| `gravity`, `coriolis`, `friction` | q; q, qd; q, qd | g; c; tau_friction |
+| `torque_std`, `out_of_distribution` | q, qd, qdd | tau_std; out_of_distribution |
+| `step_rk4`, `step_implicit_midpoint` | x, u, dt | x_next |
+
+For a phase space without forces: `rates` (qd, pd) and `hamiltonian` (H) of q, p; `phase_step_rk4` and
+`phase_step_implicit_midpoint` (q_next, p_next) of q, p, dt. For a differential network: `value`, `value_and_jacobian`
+and `value_jacobian_hessian` (y, jacobian, hessian) of x. For a model of images: the functions of its latent phase
+space, `encode` (q, p) of two images, and `decode` (frames) of q, p.
+
+NAME_jacobian returns the derivatives of all results with respect to all arguments, such as tau_q [d, d], with the
+argument's axes last. A step of x returns x_next, A and B. The derivative of a scalar is called NAME_gradient. Functions
+that a system lacks are missing.
+"""
+
+import functools
+import inspect
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import DTypeLike
+
+from dln_jax.mechanics import discrete, jacobians
+from dln_jax.mechanics.discrete import ITERATIONS, Actuation
+from dln_jax.mechanics.dynamics import Dynamics, Flow, PhaseRates, PlainFlow
+from dln_jax.mechanics.equations import Canonical, Driven, System, dynamics, flow
+from dln_jax.mechanics.jacobians import Natural
+from dln_jax.mechanics.joint_friction import LoadedSystem
+from dln_jax.models.baselines import FunctionModel
+from dln_jax.models.latent_phase import ImageModel
+from dln_jax.precision import data_type
+from dln_jax.types import InputError
+from dln_jax.zoo.catalogue import CATALOGUE
+from dln_jax.zoo.descriptions import build
+from dln_jax.zoo.run import Run
+
+Function = Callable[..., Mapping[str, Array]]
+"""A function of arrays that returns arrays by name."""
+Functions = dict[str, tuple[Function, tuple[np.ndarray, ...]]]
+"""name -> (function, one example per argument, with its shape and dtype)."""
+Named = dict[str, Function]
+LARGEST_FACTOR = 250_000
+"""Largest number of entries of a covariance factor that is exported; an entry takes about 24 bytes of C."""
+
+
+def functions_of_run(
+    run: Run,
+    *,
+    precision: str | None = None,
+    names: Iterable[str] | None = None,
+    iterations: int = ITERATIONS,
+    temperature: float | None = None,
+) -> Functions:
+    """Returns the functions of a trained model, such as `load(folder)`.
+
+    Args:
+        precision: f32 or f64, to which the parameters are converted; default: the precision of the training.
+        names: names of the functions to return; default: all.
+        iterations: as for `functions_of_system`.
+        temperature: temperature of the functions in °C, for a robot whose friction depends on it; default: the
+            reference temperature of its identification.
+
+    Raises:
+        InputError: the model lacks a named function or does not depend on temperature, the precision cannot hold a
+            parameter, or a user-defined model has no needs or is exported in another precision than it was trained in.
+    """
+    description, model = run.description, run.model
+    if temperature is not None:
+        if not np.any(description.get("cooling", 0.0)):
+            raise InputError("the model does not depend on temperature; leave --temperature out")
+        description = {**description, "temperature": float(temperature)}
+    if precision not in (None, description["precision"]):
+        if description["name"] not in CATALOGUE:
+            raise InputError(f"a user-defined model is exported in {description['precision']}, that of its training")
+        description = {**description, "precision": precision}
+    if description is not run.description:
+        model = build(description)
+    dtype = data_type(description["precision"])
+
+    def convert(leaf: Array) -> Array:
+        converted = leaf.astype(dtype)
+        if not (finite := jnp.isfinite(converted)).all():
+            raise InputError(
+                f"a parameter is {leaf[~finite][0]}, which {dtype.__name__} cannot hold; train again, or export in f64"
+            )
+        return converted
+
+    run = replace(run, model=model, description=description, parameters=jax.tree.map(convert, run.parameters))
+    if isinstance(model, FunctionModel):
+        derivatives = model.derivatives(run.parameters)
+
+        def first(count: int, x: Array) -> Any:
+            return derivatives(x)[:count]
+
+        networks = {
+            "value": _named(partial(first, 1), "y"),
+            "value_and_jacobian": _named(partial(first, 2), "y", "jacobian"),
+            "value_jacobian_hessian": _named(derivatives, "y", "jacobian", "hessian"),
+        }
+        functions = _with_examples(networks, dtype, description["sizes"][0])
+    elif isinstance(model, ImageModel):
+        images = model.images(run.parameters)
+        networks = {"encode": _named(images.encode, "q", "p"), "decode": _named(images.decode, "frames")}
+        networks |= _of_flow(images.field, iterations)
+        functions = _with_examples(networks, dtype, 1, frames=(2 * description["pixels"],))
+    elif (needs := description.get("needs")) is None:
+        raise InputError("the model states no needs; export functions_of_system of its energies")
+    else:
+        d = len(needs["joints"])
+        functions = functions_of_system(
+            run.energies, d, dtype=dtype, actuation=needs["actuation"], iterations=iterations
+        )
+        if run.uncertainty is not None and run.uncertainty.factor.size <= LARGEST_FACTOR:
+            uncertain = {
+                "torque_std": _named(run.torque_std, "tau_std"),
+                "out_of_distribution": _named(run.out_of_distribution, "out_of_distribution"),
+            }
+            functions |= _with_examples(uncertain, dtype, d)
+    chosen = list(functions) if names is None else list(names)
+    if unknown := [name for name in chosen if name not in functions]:
+        raise InputError(
+            f"a {description['name']} has no {', '.join(unknown)[:200]}; choose from {', '.join(functions)}"
+        )
+    return {name: functions[name] for name in chosen}
+
+
+def functions_of_system(
+    system: System,
+    degrees_of_freedom: int,
+    *,
+    dtype: DTypeLike,
+    actuation: Actuation = None,
+    iterations: int = ITERATIONS,
+) -> Functions:
+    """Returns the functions of a known or learned system.
+
+    Args:
+        system: a record of energies or of closed-form dynamics, such as the `closed_form` of a scene.
+        actuation: matrix [d, u] with tau = actuation u, for the steps; default: u is tau.
+        iterations: Newton steps of the implicit midpoint rule, as for `mechanics.discrete.implicit_midpoint`.
+    """
+    d = degrees_of_freedom
+    # Networks take long to trace; jitted, they are traced once instead of once per function that contains them.
+    traced = _traced_once(system)
+    link = system.link if isinstance(system, LoadedSystem) else system
+    functions: Named = {}
+    if not isinstance(system, PhaseRates):
+        functions |= _of_dynamics(traced, d, actuation, iterations)
+    if isinstance(link, Canonical | PhaseRates):
+        functions |= _of_flow(flow(traced, degrees_of_freedom=d), iterations)
+    controls = d if actuation is None else np.shape(actuation)[1]
+    return _with_examples(functions, dtype, d, x=(2 * d,), u=(controls,))
+
+
+def _traced_once(system: Any) -> Any:
+    """Returns the system with jitted functions."""
+    fields = {name: jax.jit(field) for name, field in system._asdict().items() if callable(field)}
+    if isinstance(system, LoadedSystem):
+        fields["link"] = _traced_once(system.link)
+    return system._replace(**fields)
+
+
+def _with_examples(functions: Named, dtype: DTypeLike, size: int, **shapes: tuple[int, ...]) -> Functions:
+    """Pairs functions with example vectors of this size, except for arguments with other shapes."""
+    shapes["dt"] = ()
+    return {
+        name: (
+            function,
+            tuple(np.zeros(shapes.get(key, (size,)), dtype) for key in inspect.signature(function).parameters),
+        )
+        for name, function in functions.items()
+    }
+
+
+def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) -> Named:
+    motion, rest = dynamics(system, degrees_of_freedom=d), jnp.zeros_like
+    forward, with_jacobians = jacobians.differentiable_forward_dynamics(system, degrees_of_freedom=d)
+    link = system.link if isinstance(system, LoadedSystem) else system
+    natural = isinstance(link, Natural)
+    known: list[tuple[str, str, Callable[..., Any], Callable[..., Any] | None]] = [
+        ("inverse_dynamics", "tau", motion.inverse_dynamics, partial(jacobians.inverse_dynamics_jacobians, system)),
+        ("forward_dynamics", "qdd", forward, lambda *state: with_jacobians(*state)[1]),
+        (
+            "coriolis", "c", lambda q, qd: motion.decompose(q, qd, rest(q)).coriolis,
+            partial(jacobians.coriolis_jacobians, system),
+        ),
+    ]  # fmt: skip
+    if not natural or link.potential is not None:
+        known.append(("gravity", "g", lambda q: motion.decompose(q, rest(q), rest(q)).gravity, None))
+    if isinstance(motion, Dynamics):
+        mass_matrix = (lambda q: motion.mass_matrix(q)) if natural else motion.mass_matrix
+        known += [("energy", "energy", motion.energy, None), ("mass_matrix", "M", mass_matrix, None)]
+        if getattr(system, "dissipation", None) is not None:
+            known.append(("friction", "tau_friction", motion.friction, None))
+    functions: Named = {}
+    for name, result, function, slopes in known:
+        functions |= _with_derivatives(name, function, result, slopes=slopes)
+    rk4 = discrete.rk4(forward, actuation=actuation)
+    implicit = discrete.implicit_midpoint(forward, actuation=actuation, iterations=iterations)
+    return functions | _steps("step", rk4, implicit, ("x_next",), ("A", "B"))
+
+
+def _of_flow(system: Flow | PlainFlow, iterations: int) -> Named:
+    functions = _with_derivatives("rates", system.rates, "qd", "pd")
+    if isinstance(system, Flow):
+        functions |= _with_derivatives("hamiltonian", system.energy, "H")
+    implicit = discrete.phase_implicit_midpoint(system.rates, iterations=iterations)
+    slopes = ("q_next_q", "q_next_p", "p_next_q", "p_next_p")
+    return functions | _steps("phase_step", discrete.phase_rk4(system.rates), implicit, ("q_next", "p_next"), slopes)
+
+
+def _steps(
+    prefix: str, rk4: Callable[..., Any], implicit: Callable[..., Any], results: Sequence[str], slopes: Sequence[str]
+) -> Named:
+    functions: Named = {}
+    for name, step in ((f"{prefix}_rk4", rk4), (f"{prefix}_implicit_midpoint", implicit)):
+        functions[name] = _named(step, *results)
+        functions[f"{name}_jacobian"] = _named(discrete.linearised(step), *results, *slopes)
+    return functions
+
+
+def _named(function: Callable[..., Any], *results: str) -> Function:
+    """Returns the function with named results and unchanged parameters."""
+
+    @functools.wraps(function)
+    def call(*state: Array) -> dict[str, Array]:
+        # JAX sorts the keys of a plain dictionary, and keeps the order of this one.
+        return OrderedDict(zip(results, jax.tree.leaves(function(*state)), strict=True))
+
+    return call
+
+
+def _with_derivatives(
+    name: str, function: Callable[..., Any], *results: str, slopes: Callable[..., Any] | None = None
+) -> Named:
+    """Returns the function, and the derivatives of its results by its arguments, from `slopes` where it is given."""
+    arguments = list(inspect.signature(function).parameters)
+
+    @functools.wraps(function)
+    def derivatives(*state: Array) -> Any:
+        if slopes is not None:
+            return slopes(*state)
+        rows = sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(function, *state)))
+        places = tuple(range(len(state)))
+        if rows < sum(array.size for array in state):
+            return jax.jacrev(function, argnums=places)(*state)
+        # One argument at a time: results that do not depend on it need no derivatives.
+        columns = [jax.tree.leaves(jax.jacfwd(function, argnums=place)(*state)) for place in places]
+        return list(zip(*columns, strict=True))
+
+    ending = "gradient" if name in ("energy", "hamiltonian") else "jacobian"
+    names = [f"{result}_{argument}" for result in results for argument in arguments]
+    return {name: _named(function, *results), f"{name}_{ending}": _named(derivatives, *names)}
