@@ -157,7 +157,7 @@ def functions_of_system(
     """
     d = degrees_of_freedom
     # Networks take long to trace; jitted, they are traced once instead of once per function that contains them.
-    traced = _traced_once(system)
+    traced = jax.tree.map(lambda leaf: jax.jit(leaf) if callable(leaf) else leaf, system)
     link = system.link if isinstance(system, LoadedSystem) else system
     functions: Named = {}
     if not isinstance(system, PhaseRates):
@@ -166,14 +166,6 @@ def functions_of_system(
         functions |= _of_flow(flow(traced, degrees_of_freedom=d), iterations)
     controls = d if actuation is None else np.shape(actuation)[1]
     return _with_examples(functions, dtype, d, x=(2 * d,), u=(controls,))
-
-
-def _traced_once(system: Any) -> Any:
-    """Returns the system with jitted functions."""
-    fields = {name: jax.jit(field) for name, field in system._asdict().items() if callable(field)}
-    if isinstance(system, LoadedSystem):
-        fields["link"] = _traced_once(system.link)
-    return system._replace(**fields)
 
 
 def _with_examples(functions: Named, dtype: DTypeLike, size: int, **shapes: tuple[int, ...]) -> Functions:

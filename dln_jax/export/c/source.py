@@ -22,7 +22,7 @@ from dln_jax.export.c.emit import body_of
 from dln_jax.export.c.interface import FORMAT, Signature, argument_leaves, declaration, description, result_leaves
 from dln_jax.export.c.jaxprs import repeated_calls, traced
 from dln_jax.export.c.lowering import program_of
-from dln_jax.export.c.templates import CASADI_ABOUT, CASADI_BUILD, NEEDED, about, cmake, demo, header, preamble
+from dln_jax.export.c.templates import NEEDED, about, cmake, demo, header, preamble
 from dln_jax.export.c.text import PRECISIONS, check_name, comment, kind_of
 from dln_jax.files import read_json, write_bytes
 from dln_jax.precision import computing_in, require_precision
@@ -132,9 +132,9 @@ def export_c(
             source, text, left_out = external.external_functions(
                 name, of_casadi, empty, stack=stack, leave_out=leave_out_large
             )
-            title = about(CASADI_ABOUT.format(name=name, written_by=written_by), left_out=left_out)
+            title = about(external.ABOUT.format(name=name, written_by=written_by), left_out=left_out)
             files[f"{name}_casadi.c"] = title + preamble(source, name) + text
-            files["CMakeLists.txt"] += CASADI_BUILD.format(name=name)
+            files["CMakeLists.txt"] += external.BUILD.format(name=name)
     if (longest := max(map(len, files.values()))) > LENGTH:
         raise InputError(f"the source would take {longest / 1e6:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")
     encoded = {file_name: text.encode() for file_name, text in files.items()}

@@ -61,54 +61,6 @@ $declared
 
 #endif
 """
-CASADI_DECLARATIONS = """
-typedef double casadi_real;
-typedef long long int casadi_int;
-
-#ifdef __cplusplus
-#define EXPORTED extern "C"
-#else
-#define EXPORTED
-#endif
-/* CasADi's queries about a function. The function has no state that needs reference counts, and its workspace is on
-   the stack. */
-#define DESCRIBED(f, inputs, outputs) \\
-    EXPORTED void f##_incref(void) {} \\
-    EXPORTED void f##_decref(void) {} \\
-    EXPORTED casadi_int f##_n_in(void) { return inputs; } \\
-    EXPORTED casadi_int f##_n_out(void) { return outputs; } \\
-    EXPORTED const char *f##_name_in(casadi_int i) { return f##_names[i]; } \\
-    EXPORTED const char *f##_name_out(casadi_int i) { return f##_names[inputs + i]; } \\
-    EXPORTED const casadi_int *f##_sparsity_in(casadi_int i) { return f##_sparsities[i]; } \\
-    EXPORTED const casadi_int *f##_sparsity_out(casadi_int i) { return f##_sparsities[inputs + i]; } \\
-    EXPORTED int f(const casadi_real **arg, casadi_real **res, casadi_int *integers, casadi_real *reals, int memory)
-"""
-CASADI_FUNCTION = """
-/* {cost} */
-static const char *const {symbol}_names[] = {{{names}}};
-static const casadi_int {symbol}_sparsities[][{length}] = {{{sparsities}}};
-DESCRIBED({symbol}, {inputs}, {outputs})
-{{
-{lines}
-}}
-"""
-CASADI_ABOUT = """{name}_casadi.c: functions of {name}.h with exact derivatives, for CasADi 3.6 and later.
-{written_by}
-
-cmake -B build && cmake --build build, then in Python, with the name of one of the functions for F:
-F = casadi.external("casadi_{name}_F", "build/lib{name}.so")
-
-acados loads the same library; its folder is model_external_shared_lib_dir, and its name, {name},
-model_external_shared_lib_name among the solver's options."""
-CASADI_BUILD = """
-# The library that CasADi and acados load
-add_library({name}_casadi SHARED {name}.c {name}_casadi.c)
-set_target_properties({name}_casadi PROPERTIES OUTPUT_NAME {name} ARCHIVE_OUTPUT_NAME {name}_casadi
-  C_STANDARD 99 C_EXTENSIONS OFF WINDOWS_EXPORT_ALL_SYMBOLS ON)
-if(UNIX)
-  target_link_libraries({name}_casadi PRIVATE m)
-endif()
-"""
 _START = """#include <stdio.h>
 #include <stdlib.h>
 #include <time.h>
