@@ -25,7 +25,7 @@ that a system lacks are missing.
 import functools
 import inspect
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -36,6 +36,7 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
+from dln_jax.export.c.interface import Function
 from dln_jax.mechanics import discrete, jacobians
 from dln_jax.mechanics.discrete import ITERATIONS, Actuation
 from dln_jax.mechanics.dynamics import Dynamics, Flow, PhaseRates, PlainFlow
@@ -50,11 +51,10 @@ from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import Run
 
-Function = Callable[..., Mapping[str, Array]]
-"""A function of arrays that returns arrays by name."""
 Functions = dict[str, tuple[Function, tuple[np.ndarray, ...]]]
 """name -> (function, one example per argument, with its shape and dtype)."""
 Named = dict[str, Function]
+"""Functions of arrays that return arrays by name."""
 LARGEST_FACTOR = 250_000
 """Largest number of entries of a covariance factor that is exported; an entry takes about 24 bytes of C."""
 
@@ -185,7 +185,7 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
     forward, with_jacobians = jacobians.differentiable_forward_dynamics(system, degrees_of_freedom=d)
     link = system.link if isinstance(system, LoadedSystem) else system
     natural = isinstance(link, Natural)
-    known: list[tuple[str, str, Callable[..., Any], Callable[..., Any] | None]] = [
+    known: list[tuple[str, str, Function, Function | None]] = [
         ("inverse_dynamics", "tau", motion.inverse_dynamics, partial(jacobians.inverse_dynamics_jacobians, system)),
         ("forward_dynamics", "qdd", forward, lambda *state: with_jacobians(*state)[1]),
         (
@@ -217,9 +217,7 @@ def _of_flow(system: Flow | PlainFlow, iterations: int) -> Named:
     return functions | _steps("phase_step", discrete.phase_rk4(system.rates), implicit, ("q_next", "p_next"), slopes)
 
 
-def _steps(
-    prefix: str, rk4: Callable[..., Any], implicit: Callable[..., Any], results: Sequence[str], slopes: Sequence[str]
-) -> Named:
+def _steps(prefix: str, rk4: Function, implicit: Function, results: Sequence[str], slopes: Sequence[str]) -> Named:
     functions: Named = {}
     for name, step in ((f"{prefix}_rk4", rk4), (f"{prefix}_implicit_midpoint", implicit)):
         functions[name] = _named(step, *results)
@@ -227,7 +225,7 @@ def _steps(
     return functions
 
 
-def _named(function: Callable[..., Any], *results: str) -> Function:
+def _named(function: Function, *results: str) -> Function:
     """Returns the function with named results and unchanged parameters."""
 
     @functools.wraps(function)
@@ -238,9 +236,7 @@ def _named(function: Callable[..., Any], *results: str) -> Function:
     return call
 
 
-def _with_derivatives(
-    name: str, function: Callable[..., Any], *results: str, slopes: Callable[..., Any] | None = None
-) -> Named:
+def _with_derivatives(name: str, function: Function, *results: str, slopes: Function | None = None) -> Named:
     """Returns the function, and the derivatives of its results by its arguments, from `slopes` where it is given."""
     arguments = list(inspect.signature(function).parameters)
 

@@ -32,14 +32,16 @@ from jax.flatten_util import ravel_pytree
 
 from dln_jax.export.c.body import Source
 from dln_jax.export.c.emit import body_of
-from dln_jax.export.c.interface import Leaf, argument_leaves, result_leaves
+from dln_jax.export.c.interface import Function, Leaf, argument_leaves, result_leaves
 from dln_jax.export.c.jaxprs import traced
 from dln_jax.export.c.lowering import program_of
 from dln_jax.export.c.templates import stated
 from dln_jax.types import InputError
 
-Way = Callable[[Array, Array], Array]
-"""(x, seeds) -> the results of a symbol, end to end."""
+Flat = Callable[[Array], Array]
+"""x -> y, vectors."""
+Way = Callable[[Array, Array], list[Array]]
+"""(x, seeds) -> the dense results of a symbol."""
 _DECLARATIONS = """
 typedef double casadi_real;
 typedef long long int casadi_int;
@@ -158,7 +160,7 @@ def _block(leaf: Leaf) -> Block:
     return Block(leaf.name, rows, columns)
 
 
-def _flat(function: Callable[..., Any], examples: Sequence[Any]) -> Callable[[Array], Array]:
+def _flat(function: Function, examples: Sequence[Any]) -> Flat:
     """Returns the function from all inputs to all outputs, as column-major vectors end to end."""
     leaves, tree = jax.tree.flatten(tuple(examples))
     # Column-major order of a matrix is row-major order of its transpose.
@@ -171,12 +173,12 @@ def _flat(function: Callable[..., Any], examples: Sequence[Any]) -> Callable[[Ar
     return flat
 
 
-def _forward(function: Callable[[Array], Array], x: Array) -> Array:
+def _forward(function: Flat, x: Array) -> Array:
     """Returns the transposed Jacobian [n, m] of a function from x [n] to y [m], one input at a time."""
     return lax.map(lambda k: jax.jvp(function, (x,), (_unit(k, x),))[1], jnp.arange(x.size))
 
 
-def _reverse(function: Callable[[Array], Array], x: Array) -> Array:
+def _reverse(function: Flat, x: Array) -> Array:
     """Returns the transposed Jacobian [n, m], one output at a time."""
     value, pulled = jax.vjp(function, x)
     return lax.map(lambda k: pulled(_unit(k, value))[0], jnp.arange(value.size)).T
@@ -188,7 +190,7 @@ def _unit(k: Array, like: Array) -> Array:
 
 
 def _derivatives(
-    inputs: list[Block], outputs: list[Block], flat: Callable[[Array], Array]
+    inputs: list[Block], outputs: list[Block], flat: Flat
 ) -> dict[str, tuple[list[Block], list[Block], list[Way]]]:
     """Returns prefix -> inputs, outputs, and functions that compute them, the cheapest first."""
     x_parts, y_parts = (
@@ -196,25 +198,32 @@ def _derivatives(
         for blocks in (inputs, outputs)
     )
 
-    def push(x: Array, seeds: Array) -> Array:
-        return jax.jvp(flat, (x,), (seeds,))[1]
-
-    def pull(x: Array, seeds: Array) -> Array:
-        return jax.vjp(flat, x)[1](seeds)[0]
-
-    def pull_forward(x: Array, seeds: Array) -> Array:  # also for loops of unknown length
-        return _forward(flat, x) @ seeds
+    def values(x, _):
+        return [flat(x)[j] for j in y_parts]
 
     # Rows of the transposed Jacobian are columns of the Jacobian, which CasADi stores one after the other.
-    def slopes(transpose: Callable[..., Array], x: Array, _: Array) -> Array:
-        transposed = transpose(flat, x)
-        return jnp.concatenate([transposed[i, j].ravel() for j in y_parts for i in x_parts])
+    def slopes(transposed, x, _):
+        by_x = transposed(flat, x)
+        return [by_x[i, j] for j in y_parts for i in x_parts]
 
-    def curvature(adjoint: Way, x: Array, seeds: Array) -> Array:
-        both = _forward(lambda x: jnp.concatenate([adjoint(x, seeds), flat(x)]), x)
-        hessian, transposed = both[:, : x.size], both[:, x.size :]
-        blocks = [[*(hessian[k, i] for k in x_parts), *(transposed[i, j].T for j in y_parts)] for i in x_parts]
-        return jnp.concatenate([block.ravel() for row in blocks for block in row])
+    def push(x, seeds):
+        along = jax.jvp(flat, (x,), (seeds,))[1]
+        return [along[j] for j in y_parts]
+
+    def pull(x, seeds):
+        return jax.vjp(flat, x)[1](seeds)[0]
+
+    def pull_forward(x, seeds):  # also for loops of unknown length
+        return _forward(flat, x) @ seeds
+
+    def adjoint(pull, x, seeds):
+        return [pull(x, seeds)[i] for i in x_parts]
+
+    def curvature(pull, x, seeds):
+        by_x = _forward(lambda x: jnp.concatenate([pull(x, seeds), flat(x)]), x)
+        hessian, by_seeds = by_x[:, : x.size], by_x[:, x.size :]
+        rows = ([*(hessian[k, i] for k in x_parts), *(by_seeds[i, j].T for j in y_parts)] for i in x_parts)
+        return [block for row in rows for block in row]
 
     def renamed(prefix: str, blocks: list[Block]) -> list[Block]:
         return [block._replace(name=f"{prefix}_{block.name}", dense=prefix != "out") for block in blocks]
@@ -228,18 +237,19 @@ def _derivatives(
 
     both, adjoints = [*inputs, *renamed("out", outputs)], renamed("adj", inputs)
     seeded = [*both, *renamed("adj", outputs)]
-    directions: list[Way] = [partial(slopes, _forward), partial(slopes, _reverse)]
+    directions = [_forward, _reverse]
     if x_parts[-1].stop > y_parts[-1].stop:
         directions.reverse()
+    pulls = (pull, pull_forward)
     return {
-        "": (inputs, outputs, [lambda x, _: flat(x)]),
-        "jac_": (both, jacobians(outputs, inputs), directions),
+        "": (inputs, outputs, [values]),
+        "jac_": (both, jacobians(outputs, inputs), [partial(slopes, way) for way in directions]),
         "fwd1_": ([*both, *renamed("fwd", inputs)], renamed("fwd", outputs), [push]),
-        "adj1_": (seeded, adjoints, [pull, pull_forward]),
+        "adj1_": (seeded, adjoints, [partial(adjoint, way) for way in pulls]),
         "jac_adj1_": (
             [*seeded, *renamed("out", adjoints)],
             jacobians(adjoints, seeded),
-            [partial(curvature, pull), partial(curvature, pull_forward)],
+            [partial(curvature, way) for way in pulls],
         ),
     }
 
@@ -250,19 +260,17 @@ def _function(
     """Returns the source and the C text from the first method that can be compiled."""
     dense = [k for k, block in enumerate(inputs) if block.dense]
     n = sum(block.size for block in takewhile(lambda block: block.dense, inputs))
-    cuts = np.cumsum([output.size for output in outputs if output.dense])[:-1]
+    names = {place: (f"in_{k}", False) for place, k in enumerate(dense)}
     targets = [f"res[{j}]" for j, output in enumerate(outputs) if output.dense]
     reason = ""
+
+    def evaluate(way, *columns):
+        return way(*jnp.split(jnp.concatenate(columns), [n]))
+
     for way in ways:
-
-        def evaluate(*columns: Array, way: Way = way) -> list[Array]:
-            x, seeds = jnp.split(jnp.concatenate(columns), [n])
-            return jnp.split(way(x, seeds), cuts)
-
         try:
-            closed, _ = traced(evaluate, [np.zeros(inputs[k].size) for k in dense])
+            closed, _ = traced(partial(evaluate, way), [np.zeros(inputs[k].size) for k in dense])
             program, arguments, results = program_of(closed, finite=source.finite)
-            names = {place: (f"in_{k}", False) for place, k in enumerate(dense)}
             body = body_of(source.copy(), program, results, names, targets, optional=True)
         except (TypeError, ValueError, NotImplementedError) as error:  # JAX cannot differentiate it, or it has no C
             reason = str(error).strip().partition("\n")[0]

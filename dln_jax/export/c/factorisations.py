@@ -192,49 +192,45 @@ def definitions(names: Collection[str], suffix: str) -> str:
     return text.replace("SQRT(", f"sqrt{suffix}(").replace("FABS(", f"fabs{suffix}(")
 
 
-def _eliminations(rows: int, columns: int) -> dict[str, int]:
-    steps = range(min(rows, columns))
-    return {
-        "div": sum(rows - k - 1 for k in steps),
-        "multiply_add": sum((rows - k - 1) * (columns - k - 1) for k in steps),
-    }
-
-
-def _reflections(m: int, n: int) -> dict[str, int]:
-    every = 2 * m * n * min(m, n)
-    return {"div": min(m, n) * (2 * m + 5), "multiply_add": every, "mul": every, "sqrt": 2 * min(m, n)}
-
-
-_SIZES = {
-    "cholesky": lambda a, _: (
-        a[0], {"multiply_add": (a[0] ** 3 - a[0]) // 6, "div": a[0] * (a[0] - 1) // 2, "sqrt": a[0]}
-    ),
-    "triangular_solve": lambda a, b, _: (
-        *b, {"multiply_add": a[0] * (a[0] - 1) // 2 * b[1], "div": a[0] * b[1]}
-    ),
-    "lu": lambda a, _: (*a, _eliminations(*a)),
-    "permutation": lambda pivots, order: (*order, *pivots, {}),
-    "geqrf": lambda a, _: (*a, _reflections(*a)),
-    "householder_product": lambda a, tau, _: (
-        *a, *tau, {"multiply_add": 2 * a[0] * a[1] * tau[0], "mul": a[0] * a[1] * tau[0]}
-    ),
-    "eigh": lambda a, _: (a[0], {
-        name: _SWEEPS * a[0] * (a[0] - 1) // 2 * count
-        for name, count in {"mul": 8 * a[0] + 4, "add": 4 * a[0] + 9, "div": 5, "sqrt": 2}.items()
-    }),
+_COSTS = {
+    "cholesky": lambda n: {"multiply_add": (n**3 - n) // 6, "div": n * (n - 1) // 2, "sqrt": n},
+    "triangular_solve": lambda n, columns: {"multiply_add": n * (n - 1) // 2 * columns, "div": n * columns},
+    "lu": lambda n, m: {
+        "multiply_add": sum((n - k) * (m - k) for k in range(1, min(n, m) + 1)),
+        "div": sum(n - k for k in range(1, min(n, m) + 1)),
+    },
+    "permutation": lambda n, exchanges: {},
+    "geqrf": lambda m, n: {
+        "multiply_add": 2 * m * n * min(m, n), "mul": 2 * m * n * min(m, n), "div": min(m, n) * (2 * m + 5),
+        "sqrt": 2 * min(m, n),
+    },
+    "householder_product": lambda m, n, k: {"multiply_add": 2 * m * n * k, "mul": m * n * k},
+    "eigh": lambda n: {
+        name: _SWEEPS * n * (n - 1) // 2 * count
+        for name, count in {"mul": 8 * n + 4, "add": 4 * n + 9, "div": 5, "sqrt": 2}.items()
+    },
 }  # fmt: skip
-"""Sizes passed to a C function, and an upper bound on its operations, by the shapes of arguments and result."""
+"""Upper bound on the operations of a C function, by the sizes that it takes."""
 
 
 def _call(body: Body, node: Node) -> None:
     """Calls a node's C function with sizes, pointers to the arguments, and arrays for the results."""
     body.source.kernels.add(node.op)
-    *sizes, operations = _SIZES[node.op](*(arg.shape for arg in node.args), node.shape)
-    a, arrays = node.args[0], []
-    if node.op == "lu":  # results of two types, which `project` nodes read
-        arrays = [("real", a.size), ("int", min(a.shape)), ("int", a.shape[0])]
-    elif node.op == "eigh":  # a workspace
-        arrays = [("real", a.size)]
+    a = node.args[0]
+    sizes, arrays = a.shape, []
+    match node.op:
+        case "triangular_solve":
+            sizes = node.args[1].shape
+        case "permutation":
+            sizes = *node.shape, *a.shape
+        case "householder_product":
+            sizes = *a.shape, *node.args[1].shape
+        case "lu":  # results of two types, which `project` nodes read
+            arrays = [("real", a.size), ("int", min(a.shape)), ("int", a.shape[0])]
+        case "cholesky":
+            sizes = a.shape[:1]
+        case "eigh":
+            sizes, arrays = a.shape[:1], [("real", a.size)]  # a workspace
     targets = [f"v{node.number}_{place}" for place in range(len(arrays))]
     for target, (kind, size) in zip(targets, arrays, strict=True):
         body.declared(target, kind, size)
@@ -242,7 +238,7 @@ def _call(body: Body, node: Node) -> None:
     prefix = "" if node.op in ("cholesky", "triangular_solve", "lu") else "elementary_"
     values = [*sizes, *map(int, node.attribute or ()), *map(body.pointer, node.args), *targets]
     body.line(f"{prefix}{node.op}({', '.join(map(str, values))});")
-    body.spend(**operations)
+    body.spend(**_COSTS[node.op](*sizes))
 
 
 WRITERS = dict.fromkeys(FUNCTIONS, _call)

@@ -17,6 +17,7 @@ from dln_jax.types import InputError
 FORMAT = 6
 """Version of the names and signatures in exported sources and of the JSON description."""
 AGAIN = "export it again"
+Function = Callable[..., Any]
 KINDS = {kind: c for kind, c in C_TYPES.items() if kind != "index"}
 
 
@@ -69,7 +70,7 @@ class Signature(NamedTuple):
         return () if self.returns else self.results
 
 
-def argument_leaves(function: Callable[..., Any], examples: Sequence[Any]) -> list[Leaf]:
+def argument_leaves(function: Function, examples: Sequence[Any]) -> list[Leaf]:
     """Returns the argument arrays, named after the function's parameters and, in a tree, the path of the leaf."""
     try:
         names = list(inspect.signature(function).parameters)
@@ -92,8 +93,7 @@ def result_leaves(shapes: Any, taken: Sequence[Leaf]) -> list[Leaf]:
 def _leaves(name: str, tree: Any) -> list[Leaf]:
     leaves = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
-        parts = [str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", "")))) for key in path]
-        whole = "_".join(part for part in (name, *parts) if part)
+        whole = "_".join(filter(None, (name, jax.tree_util.keystr(path, simple=True, separator="_"))))
         whole = f"result_{whole}" if whole[:1].isdigit() else whole
         leaves.append(Leaf(whole, kind_of(jax.dtypes.canonicalize_dtype(leaf.dtype)), tuple(map(int, leaf.shape))))
     return leaves

@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from dln_jax.export.c.interface import KINDS, Leaf, Signature, read_interface
+from dln_jax.export.c.interface import KINDS, Function, Leaf, Signature, read_interface
 from dln_jax.export.c.text import NUMPY_TYPES, PRECISIONS, UNSIGNED, check_name
 from dln_jax.mechanics.arguments import require_shape
 from dln_jax.types import InputError
@@ -71,7 +71,7 @@ def load_c(
     except OSError as error:
         raise InputError(f"{directory}: not to be built in a temporary folder ({error}); set TMPDIR") from error
     make.argtypes, make.restype = (ctypes.c_int, ctypes.py_object), ctypes.py_object
-    made: dict[str, Callable[..., Any]] = {}
+    made: dict[str, Function] = {}
     for number, (key, signature) in enumerate(signatures.items()):
         convert = functools.partial(_call_converted, made, key, signature.arguments, types)
         group = collections.namedtuple(f"{key}_results", [leaf.name for leaf in signature.results])
@@ -92,7 +92,7 @@ def compile_c(arguments: Sequence[str], compiler: str | None = None) -> None:
 
 
 def _call_converted(
-    made: Mapping[str, Callable[..., Any]],
+    made: Mapping[str, Function],
     name: str,
     leaves: Sequence[Leaf],
     types: Mapping[str, DTypeLike],

@@ -8,7 +8,7 @@ import functools
 import importlib.metadata
 import re
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,15 @@ import numpy as np
 from dln_jax.export.c import casadi as external
 from dln_jax.export.c.body import Source
 from dln_jax.export.c.emit import body_of
-from dln_jax.export.c.interface import FORMAT, Signature, argument_leaves, declaration, description, result_leaves
+from dln_jax.export.c.interface import (
+    FORMAT,
+    Function,
+    Signature,
+    argument_leaves,
+    declaration,
+    description,
+    result_leaves,
+)
 from dln_jax.export.c.jaxprs import repeated_calls, traced
 from dln_jax.export.c.lowering import program_of
 from dln_jax.export.c.templates import NEEDED, about, cmake, demo, header, preamble
@@ -28,7 +36,7 @@ from dln_jax.files import read_json, write_bytes
 from dln_jax.precision import computing_in, require_precision
 from dln_jax.types import InputError, require_positive
 
-Functions = Mapping[str, tuple[Callable[..., Any], Sequence[Any]]]
+Functions = Mapping[str, tuple[Function, Sequence[Any]]]
 """Functions of arrays by name, with example arguments."""
 STACK = 256 * 1024
 """Default limit in bytes of the stack that a function may use."""
@@ -36,10 +44,6 @@ LENGTH = 10_000_000
 """Largest size of a source in bytes."""
 LINES = 4000
 """A function of more lines, including callees, is not exported by default."""
-
-
-class TooLargeError(InputError):
-    """A function needs more stack, or more lines, than suits generated C."""
 
 
 def export_c(
@@ -82,7 +86,7 @@ def export_c(
     check_name(name)
     if not functions:
         raise InputError("there is no function to export; give at least one, as {'name': (function, examples)}")
-    chosen: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {}
+    chosen: dict[str, tuple[Function, tuple[Any, ...]]] = {}
     for key, pair in functions.items():
         if not (isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[1], tuple | list)):
             raise InputError(
@@ -109,17 +113,18 @@ def export_c(
         repeated = repeated_calls([closed for _, closed in every.values()])
         for key, (signature, closed) in every.items():
             with_function = source.copy()
-            try:
-                signature, text, lines = _function(with_function, name, key, signature, closed, repeated, stack)
-                if leave_out_large and lines > LINES:
-                    raise TooLargeError(f"{key}, of {lines} lines")
-            except TooLargeError as error:
+            signature, text, lines = _function(with_function, name, key, signature, closed, repeated)
+            if (used := signature.cost.stack_bytes) > stack:
+                large = f"{key} would take {used / 1024:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB"
                 if not leave_out_large:
-                    raise
-                left_out.append(f"{error}; ask for it by name.")
+                    raise InputError(large)
+            elif not leave_out_large or lines <= LINES:
+                source, signatures[key] = with_function, signature
+                texts.append(text)
                 continue
-            source, signatures[key] = with_function, signature
-            texts.append(text)
+            else:
+                large = f"{key}, of {lines} lines"
+            left_out.append(f"{large}; ask for it by name.")
         parts = dict.fromkeys(part.text for part in source.parts.values())
         files = {
             f"{name}.h": header(name, written_by, signatures, precision, left_out),
@@ -149,7 +154,7 @@ def _array(leaf: Any) -> Any:
     return leaf if hasattr(leaf, "dtype") else np.asarray(leaf)
 
 
-def _in_written_order(function: Callable[..., Any]) -> Callable[..., Any]:
+def _in_written_order(function: Function) -> Function:
     """Returns the function with its results in the order in which a dictionary was written; JAX would sort the keys."""
 
     def ordered(tree: Any) -> Any:
@@ -162,7 +167,7 @@ def _in_written_order(function: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def _traced(key: str, function: Callable[..., Any], examples: Any, precision: str) -> tuple[Signature, Any]:
+def _traced(key: str, function: Function, examples: Any, precision: str) -> tuple[Signature, Any]:
     """Returns the signature, without costs, and the closed jaxpr of a function."""
     real = PRECISIONS[precision][0]
     try:
@@ -175,7 +180,7 @@ def _traced(key: str, function: Callable[..., Any], examples: Any, precision: st
 
 
 def _function(
-    source: Source, name: str, key: str, signature: Signature, closed: Any, repeated: Collection[int], stack: int
+    source: Source, name: str, key: str, signature: Signature, closed: Any, repeated: Collection[int]
 ) -> tuple[Signature, str, int]:
     """Returns the signature with costs, the C text, and the number of lines of a function, including callees."""
     named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(signature.arguments)}
@@ -185,10 +190,6 @@ def _function(
         body = body_of(source, program, results, named, targets)
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
-    if body.stack > stack:
-        raise TooLargeError(
-            f"{key} would take {body.stack / 1024:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB"
-        )
     words = set(re.findall(r"\w+", "\n".join(body.lines)))
     leaves = [*signature.arguments, *signature.written]
     lines = "\n".join([*(f"    (void){leaf.name};" for leaf in leaves if leaf.name not in words), *body.lines])
