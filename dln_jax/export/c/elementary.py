@@ -33,6 +33,7 @@ VECTORISED = tuple(OPERATIONS)
 _CONSTANTS = {
     "f64": """
 typedef uint64_t elementary_word;
+#define elementary_exact FLT_EVAL_METHOD == 0 || FLT_EVAL_METHOD == 1 /* 1: float is computed in double */
 #define elementary_mantissa 52
 #define elementary_exponent_bits 11
 #define elementary_bias 1023
@@ -88,6 +89,7 @@ typedef uint64_t elementary_word;
 """,
     "f32": """
 typedef uint32_t elementary_word;
+#define elementary_exact FLT_EVAL_METHOD == 0
 #define elementary_mantissa 23
 #define elementary_exponent_bits 8
 #define elementary_bias 127
@@ -165,13 +167,8 @@ static inline elementary_word elementary_ordered(real x)
 }
 """,
 }
-# With method 1, float is computed in double, which breaks only the functions of float.
-_EVALUATION = {
-    "f64": "FLT_EVAL_METHOD != 0 && FLT_EVAL_METHOD != 1",
-    "f32": "FLT_EVAL_METHOD != 0",
-}
 _EVALUATED = """
-#if defined(FLT_EVAL_METHOD) && $method
+#if defined(FLT_EVAL_METHOD) && !(elementary_exact)
 #error "FLT_EVAL_METHOD: extended precision makes exp and others wrong; give -mfpmath=sse -msse2, or no \\
 -DDLN_OWN_ELEMENTARY"
 #endif
@@ -203,6 +200,12 @@ _LOGARITHM = """
     const real not_zero = elementary_choice(y == 0, -(real)INFINITY, value);
     const real not_negative = elementary_choice(y < 0, (real)NAN, not_zero);
     const real result = elementary_choice(y < (real)INFINITY, not_negative, x);"""
+_WITHIN = """
+static inline real elementary_$name(real x)
+{
+    return fabs${f}(x) <= elementary_bound ? elementary_${name}_within(x) : $name${f}(x);
+}
+"""
 _OWN = {
     "exp": f"""
 static inline real elementary_exp(real x)
@@ -249,7 +252,7 @@ static inline real elementary_sin_within(real x)
     const elementary_word value = elementary_word_of(elementary_choice((int)(quadrant & 1), cosine, sine));
     return elementary_number_of(value ^ ((quadrant & 2) << elementary_to_sign) ^ odd);
 }}
-""",
+{_WITHIN}""",
     "cos": f"""
 static inline real elementary_cos_within(real x)
 {{{_QUADRANT}
@@ -257,7 +260,7 @@ static inline real elementary_cos_within(real x)
     const elementary_word value = elementary_word_of(elementary_choice((int)(quadrant & 1), cosine, sine));
     return elementary_number_of(value ^ ((quadrant & 2) << elementary_to_sign));
 }}
-""",
+{_WITHIN}""",
     "log": f"""
 static inline real elementary_log(real x)
 {{
@@ -296,12 +299,6 @@ static inline void elementary_sin_cos(real x, real *sine_of_x, real *cosine_of_x
 }}
 """,
 }
-_BOUNDED = """
-static inline real elementary_$name(real x)
-{
-    return fabs${f}(x) <= elementary_bound ? elementary_${name}_within(x) : $name${f}(x);
-}
-"""
 _BOUNDED_EACH = """
 static void elementary_${name}_each(int n, const real *RESTRICT x, real *RESTRICT y)
 {
@@ -344,12 +341,11 @@ def definitions(names: Iterable[str], precision: str, *, arrays: Iterable[str] =
     helpers = _CONSTANTS[precision] + _COMMON
     own = library = ""
     for name in (name for name in _OWN if name in needed):
-        bounded = name in ("sin", "cos")
-        texts = [_OWN[name], _BOUNDED * bounded, (_BOUNDED_EACH if bounded else _EACH) * (name in arrays)]
-        own += fill("".join(texts), precision, name=name)
-        texts = [_BOTH_OF_LIBRARY if name == "sin_cos" else _OF_LIBRARY, _EACH * (name in arrays)]
-        library += fill("".join(texts), precision, name=name)
-    if own:
-        evaluated = fill(_EVALUATED, precision, method=_EVALUATION[precision])
-        own = f"\n#ifdef DLN_OWN_ELEMENTARY{evaluated}{helpers * (not bits)}{own}\n#else\n{library}#endif\n"
-    return "".join([helpers * bool(bits), *bits, own])  # compilers warn about functions that nothing calls
+        of_library = _BOTH_OF_LIBRARY if name == "sin_cos" else _OF_LIBRARY
+        each = _BOUNDED_EACH if name in ("sin", "cos") else _EACH
+        own += fill(_OWN[name] + each * (name in arrays), precision, name=name)
+        library += fill(of_library + _EACH * (name in arrays), precision, name=name)
+    if own:  # compilers warn about functions that nothing calls
+        unshared = "" if bits else helpers
+        own = f"\n#ifdef DLN_OWN_ELEMENTARY{unshared}{_EVALUATED}{own}\n#else\n{library}#endif\n"
+    return "".join([helpers if bits else "", *bits, own])

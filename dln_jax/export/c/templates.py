@@ -61,37 +61,48 @@ $declared
 
 #endif
 """
-_START = """#include <stdio.h>
+_DEMO = """#include <stdio.h>
 #include <stdlib.h>
 #include <time.h>
 
-#include "{name}.h"
+#include "$name.h"
+
+typedef $real real;
 
 /* Uniform in [-1, 1), the same on every machine */
 static unsigned long seed_ = 1;
 
-static {real} uniform_(void)
-{{
+static real uniform_(void)
+{
     seed_ = (1103515245UL * seed_ + 12345UL) & 0x7fffffffUL;
-    return ({real})seed_ / ({real})0x40000000UL - 1;
-}}
+    return (real)seed_ / (real)0x40000000UL - 1;
+}
+
+#define FILL_(x, n, value) for (int i_ = 0; i_ < n; ++i_) x[i_] = value
+#define PRINT_(name, x, n) \\
+    printf(name ":"); \\
+    for (int i_ = 0; i_ < n; ++i_) printf(" %.9g", (double)x[i_]); \\
+    printf("\\n")
+/* Repeated calls, again if the clock has not moved. The state changes between them, so that none can be removed */
+#define TIME_(name, change, call) \\
+    if (calls_ > 0) { \\
+        const clock_t start_ = clock(); \\
+        clock_t end_ = start_; \\
+        double made_ = 0; \\
+        while (end_ == start_) { \\
+            for (long k_ = 0; k_ < calls_; ++k_) { change; call; } \\
+            made_ += (double)calls_; \\
+            end_ = clock(); \\
+        } \\
+        const double each_ = (double)(end_ - start_) / CLOCKS_PER_SEC / made_; \\
+        printf(name ": %.0f calls/s, %.3f us each\\n", 1 / each_, 1e6 * each_); \\
+    }
 
 int main(int arguments_, char **argument_)
-{{
+{
     const long calls_ = arguments_ > 1 ? atol(argument_[1]) : 0;
-"""
-_TIMED = """        if (calls_ > 0) {{
-            const clock_t start_ = clock();
-            clock_t end_ = start_;
-            double made_ = 0;
-            while (end_ == start_) {{ /* again if the clock has not moved */
-                for (long k_ = 0; k_ < calls_; ++k_) {{ {moved}{call}; }}
-                made_ += (double)calls_;
-                end_ = clock();
-            }}
-            const double each_ = (double)(end_ - start_) / CLOCKS_PER_SEC / made_;
-            printf("{function}: %.0f calls/s, %.3f us each\\n", 1 / each_, 1e6 * each_);
-        }}
+$blocks    return 0;
+}
 """
 
 
@@ -100,34 +111,29 @@ def demo(name: str, functions: Mapping[str, Signature], precision: str) -> str:
 
     Real arguments are random, except that a time step `dt` is a millisecond.
     """
-    real = PRECISIONS[precision][1]
-    kinds = {**KINDS, "real": real}
-    text = comment(
-        f"{name}_demo.c: prints the results of the functions of {name}.h at one state.",
-        f"cc -std=c99 -O3 -march=native -DDLN_OWN_ELEMENTARY {name}.c {name}_demo.c -lm -o {name}_demo\n"
-        f"./{name}_demo 1000000    also times a million calls of each",
-    ) + _START.format(name=name, real=real)
+    blocks = ""
     for key, function in functions.items():
         leaves = [*function.arguments, *function.results]
         names = [leaf.name if leaf.shape else f"{leaf.name}[0]" for leaf in leaves]
         call = f"{name}_{key}({', '.join(names[: len(names) - function.returns])})"
         call = f"{names[-1]} = {call}" if function.returns else call
-        lines = [f"static {kinds[leaf.kind]} {leaf.name}[{max(prod(leaf.shape), 1)}];" for leaf in leaves]
-        for leaf in function.arguments:
-            value = "uniform_()" if leaf.kind == "real" else "0"
-            value = f"({real})1e-3" if leaf.name == "dt" else value  # discrete-time steps have this argument
-            lines.append(f"for (int i_ = 0; i_ < {prod(leaf.shape)}; ++i_) {leaf.name}[i_] = {value};")
+        lines = [f"static {KINDS[leaf.kind]} {leaf.name}[{max(prod(leaf.shape), 1)}];" for leaf in leaves]
+        change = "(void)0"
+        for leaf in reversed(function.arguments):
+            value = "0"
+            if leaf.kind == "real":
+                change = f"{leaf.name}[0] += (real)1e-6"
+                value = "(real)1e-3" if leaf.name == "dt" else "uniform_()"  # discrete-time steps have this argument
+            lines.append(f"FILL_({leaf.name}, {prod(leaf.shape)}, {value});")
         lines.append(f"{call};")
-        for leaf in function.results:
-            printed = f'printf(" %.9g", (double){leaf.name}[i_]);'
-            lines += [f'printf("{key} {leaf.name}:");', f"for (int i_ = 0; i_ < {prod(leaf.shape)}; ++i_) {printed}"]
-            lines.append('printf("\\n");')
-        # The state changes between calls, so that the compiler cannot remove any.
-        first = next((leaf.name for leaf in function.arguments if leaf.kind == "real"), None)
-        moved = f"{first}[0] += ({real})1e-6; " if first else ""
-        text += "    {\n" + "".join(f"        {line}\n" for line in lines)
-        text += _TIMED.format(moved=moved, call=call, function=f"{name}_{key}") + "    }\n"
-    return text + "    return 0;\n}\n"
+        lines += [f'PRINT_("{key} {leaf.name}", {leaf.name}, {prod(leaf.shape)});' for leaf in function.results]
+        lines.append(f'TIME_("{name}_{key}", {change}, {call})')
+        blocks += "    {\n" + "".join(f"        {line}\n" for line in lines) + "    }\n"
+    return comment(
+        f"{name}_demo.c: prints the results of the functions of {name}.h at one state.",
+        f"cc -std=c99 -O3 -march=native -DDLN_OWN_ELEMENTARY {name}.c {name}_demo.c -lm -o {name}_demo\n"
+        f"./{name}_demo 1000000    also times a million calls of each",
+    ) + fill(_DEMO, precision, name=name, blocks=blocks)
 
 
 def cmake(name: str) -> str:
