@@ -28,12 +28,10 @@ from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jax.typing import DTypeLike
 
 from dln_jax.export.c.interface import Function
@@ -42,7 +40,6 @@ from dln_jax.mechanics.discrete import ITERATIONS, Actuation
 from dln_jax.mechanics.dynamics import Dynamics, Flow, PhaseRates, PlainFlow
 from dln_jax.mechanics.equations import Canonical, Driven, System, dynamics, flow
 from dln_jax.mechanics.jacobians import Natural
-from dln_jax.mechanics.joint_friction import LoadedSystem
 from dln_jax.models.baselines import FunctionModel
 from dln_jax.models.latent_phase import ImageModel
 from dln_jax.precision import data_type
@@ -93,7 +90,7 @@ def functions_of_run(
         model = build(description)
     dtype = data_type(description["precision"])
 
-    def convert(leaf: Array) -> Array:
+    def convert(leaf):
         converted = leaf.astype(dtype)
         if not (finite := jnp.isfinite(converted)).all():
             raise InputError(
@@ -105,7 +102,7 @@ def functions_of_run(
     if isinstance(model, FunctionModel):
         derivatives = model.derivatives(run.parameters)
 
-        def first(count: int, x: Array) -> Any:
+        def first(count, x):
             return derivatives(x)[:count]
 
         networks = {
@@ -158,11 +155,10 @@ def functions_of_system(
     d = degrees_of_freedom
     # Networks take long to trace; jitted, they are traced once instead of once per function that contains them.
     traced = jax.tree.map(lambda leaf: jax.jit(leaf) if callable(leaf) else leaf, system)
-    link = system.link if isinstance(system, LoadedSystem) else system
     functions: Named = {}
     if not isinstance(system, PhaseRates):
         functions |= _of_dynamics(traced, d, actuation, iterations)
-    if isinstance(link, Canonical | PhaseRates):
+    if isinstance(getattr(system, "link", system), Canonical | PhaseRates):
         functions |= _of_flow(flow(traced, degrees_of_freedom=d), iterations)
     controls = d if actuation is None else np.shape(actuation)[1]
     return _with_examples(functions, dtype, d, x=(2 * d,), u=(controls,))
@@ -183,26 +179,25 @@ def _with_examples(functions: Named, dtype: DTypeLike, size: int, **shapes: tupl
 def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) -> Named:
     motion, rest = dynamics(system, degrees_of_freedom=d), jnp.zeros_like
     forward, with_jacobians = jacobians.differentiable_forward_dynamics(system, degrees_of_freedom=d)
-    link = system.link if isinstance(system, LoadedSystem) else system
+    link = getattr(system, "link", system)
     natural = isinstance(link, Natural)
-    known: list[tuple[str, str, Function, Function | None]] = [
-        ("inverse_dynamics", "tau", motion.inverse_dynamics, partial(jacobians.inverse_dynamics_jacobians, system)),
-        ("forward_dynamics", "qdd", forward, lambda *state: with_jacobians(*state)[1]),
-        (
-            "coriolis", "c", lambda q, qd: motion.decompose(q, qd, rest(q)).coriolis,
-            partial(jacobians.coriolis_jacobians, system),
-        ),
-    ]  # fmt: skip
+
+    def coriolis(q, qd):
+        return motion.decompose(q, qd, rest(q)).coriolis
+
+    of_inverse = partial(jacobians.inverse_dynamics_jacobians, system)
+    of_coriolis = partial(jacobians.coriolis_jacobians, system)
+    functions = _with_derivatives("inverse_dynamics", motion.inverse_dynamics, "tau", slopes=of_inverse)
+    functions |= _with_derivatives("forward_dynamics", forward, "qdd", slopes=lambda *state: with_jacobians(*state)[1])
+    functions |= _with_derivatives("coriolis", coriolis, "c", slopes=of_coriolis)
     if not natural or link.potential is not None:
-        known.append(("gravity", "g", lambda q: motion.decompose(q, rest(q), rest(q)).gravity, None))
+        functions |= _with_derivatives("gravity", lambda q: motion.decompose(q, rest(q), rest(q)).gravity, "g")
     if isinstance(motion, Dynamics):
         mass_matrix = (lambda q: motion.mass_matrix(q)) if natural else motion.mass_matrix
-        known += [("energy", "energy", motion.energy, None), ("mass_matrix", "M", mass_matrix, None)]
+        functions |= _with_derivatives("energy", motion.energy, "energy")
+        functions |= _with_derivatives("mass_matrix", mass_matrix, "M")
         if getattr(system, "dissipation", None) is not None:
-            known.append(("friction", "tau_friction", motion.friction, None))
-    functions: Named = {}
-    for name, result, function, slopes in known:
-        functions |= _with_derivatives(name, function, result, slopes=slopes)
+            functions |= _with_derivatives("friction", motion.friction, "tau_friction")
     rk4 = discrete.rk4(forward, actuation=actuation)
     implicit = discrete.implicit_midpoint(forward, actuation=actuation, iterations=iterations)
     return functions | _steps("step", rk4, implicit, ("x_next",), ("A", "B"))
@@ -225,11 +220,11 @@ def _steps(prefix: str, rk4: Function, implicit: Function, results: Sequence[str
     return functions
 
 
-def _named(function: Function, *results: str) -> Function:
-    """Returns the function with named results and unchanged parameters."""
+def _named(function: Function, *results: str, like: Function | None = None) -> Function:
+    """Returns the function with named results, and with the parameters of another."""
 
-    @functools.wraps(function)
-    def call(*state: Array) -> dict[str, Array]:
+    @functools.wraps(like or function)
+    def call(*state):
         # JAX sorts the keys of a plain dictionary, and keeps the order of this one.
         return OrderedDict(zip(results, jax.tree.leaves(function(*state)), strict=True))
 
@@ -238,12 +233,8 @@ def _named(function: Function, *results: str) -> Function:
 
 def _with_derivatives(name: str, function: Function, *results: str, slopes: Function | None = None) -> Named:
     """Returns the function, and the derivatives of its results by its arguments, from `slopes` where it is given."""
-    arguments = list(inspect.signature(function).parameters)
 
-    @functools.wraps(function)
-    def derivatives(*state: Array) -> Any:
-        if slopes is not None:
-            return slopes(*state)
+    def derivatives(*state):
         rows = sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(function, *state)))
         places = tuple(range(len(state)))
         if rows < sum(array.size for array in state):
@@ -253,5 +244,8 @@ def _with_derivatives(name: str, function: Function, *results: str, slopes: Func
         return list(zip(*columns, strict=True))
 
     ending = "gradient" if name in ("energy", "hamiltonian") else "jacobian"
-    names = [f"{result}_{argument}" for result in results for argument in arguments]
-    return {name: _named(function, *results), f"{name}_{ending}": _named(derivatives, *names)}
+    names = [f"{result}_{argument}" for result in results for argument in inspect.signature(function).parameters]
+    return {
+        name: _named(function, *results),
+        f"{name}_{ending}": _named(slopes or derivatives, *names, like=function),
+    }

@@ -166,7 +166,7 @@ def _flat(function: Function, examples: Sequence[Any]) -> Flat:
     # Column-major order of a matrix is row-major order of its transpose.
     _, parts_of = ravel_pytree([jnp.asarray(leaf).T for leaf in leaves])
 
-    def flat(x: Array) -> Array:
+    def flat(x):
         results = jax.tree.leaves(function(*jax.tree.unflatten(tree, [part.T for part in parts_of(x)])))
         return jnp.concatenate([jnp.ravel(jnp.asarray(result).T).astype(x.dtype) for result in results])
 
@@ -175,18 +175,18 @@ def _flat(function: Function, examples: Sequence[Any]) -> Flat:
 
 def _forward(function: Flat, x: Array) -> Array:
     """Returns the transposed Jacobian [n, m] of a function from x [n] to y [m], one input at a time."""
-    return lax.map(lambda k: jax.jvp(function, (x,), (_unit(k, x),))[1], jnp.arange(x.size))
+
+    def along(k):
+        # A comparison, because rows of an identity matrix would be stored in an array.
+        return jax.jvp(function, (x,), ((jnp.arange(x.size) == k).astype(x.dtype),))[1]
+
+    return lax.map(along, jnp.arange(x.size))
 
 
 def _reverse(function: Flat, x: Array) -> Array:
     """Returns the transposed Jacobian [n, m], one output at a time."""
     value, pulled = jax.vjp(function, x)
-    return lax.map(lambda k: pulled(_unit(k, value))[0], jnp.arange(value.size)).T
-
-
-def _unit(k: Array, like: Array) -> Array:
-    # A comparison, because rows of an identity matrix would be stored in an array.
-    return (jnp.arange(like.size) == k).astype(like.dtype)
+    return _forward(lambda seeds: pulled(seeds)[0], jnp.zeros_like(value)).T
 
 
 def _derivatives(
@@ -198,8 +198,8 @@ def _derivatives(
         for blocks in (inputs, outputs)
     )
 
-    def values(x, _):
-        return [flat(x)[j] for j in y_parts]
+    def split(vector, parts):
+        return [vector[part] for part in parts]
 
     # Rows of the transposed Jacobian are columns of the Jacobian, which CasADi stores one after the other.
     def slopes(transposed, x, _):
@@ -207,8 +207,7 @@ def _derivatives(
         return [by_x[i, j] for j in y_parts for i in x_parts]
 
     def push(x, seeds):
-        along = jax.jvp(flat, (x,), (seeds,))[1]
-        return [along[j] for j in y_parts]
+        return split(jax.jvp(flat, (x,), (seeds,))[1], y_parts)
 
     def pull(x, seeds):
         return jax.vjp(flat, x)[1](seeds)[0]
@@ -217,7 +216,7 @@ def _derivatives(
         return _forward(flat, x) @ seeds
 
     def adjoint(pull, x, seeds):
-        return [pull(x, seeds)[i] for i in x_parts]
+        return split(pull(x, seeds), x_parts)
 
     def curvature(pull, x, seeds):
         by_x = _forward(lambda x: jnp.concatenate([pull(x, seeds), flat(x)]), x)
@@ -225,10 +224,10 @@ def _derivatives(
         rows = ([*(hessian[k, i] for k in x_parts), *(by_seeds[i, j].T for j in y_parts)] for i in x_parts)
         return [block for row in rows for block in row]
 
-    def renamed(prefix: str, blocks: list[Block]) -> list[Block]:
+    def renamed(prefix, blocks):
         return [block._replace(name=f"{prefix}_{block.name}", dense=prefix != "out") for block in blocks]
 
-    def jacobians(results: list[Block], variables: list[Block]) -> list[Block]:
+    def jacobians(results, variables):
         return [
             Block(f"jac_{result.name}_{variable.name}", result.size, variable.size, variable.dense)
             for result in results
@@ -242,7 +241,7 @@ def _derivatives(
         directions.reverse()
     pulls = (pull, pull_forward)
     return {
-        "": (inputs, outputs, [values]),
+        "": (inputs, outputs, [lambda x, _: split(flat(x), y_parts)]),
         "jac_": (both, jacobians(outputs, inputs), [partial(slopes, way) for way in directions]),
         "fwd1_": ([*both, *renamed("fwd", inputs)], renamed("fwd", outputs), [push]),
         "adj1_": (seeded, adjoints, [partial(adjoint, way) for way in pulls]),

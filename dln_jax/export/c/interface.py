@@ -84,16 +84,15 @@ def argument_leaves(function: Function, examples: Sequence[Any]) -> list[Leaf]:
 def result_leaves(shapes: Any, taken: Sequence[Leaf]) -> list[Leaf]:
     """Returns the result arrays, named after their keys, or `result` if there are none."""
     used = {leaf.name for leaf in taken}
-    leaves = _leaves("" if jax.tree.structure(shapes) != jax.tree.structure(0) else "result", shapes)
-    return _checked(
-        [leaf._replace(name=f"{leaf.name}_result") if leaf.name in used else leaf for leaf in leaves], "a result"
-    )
+    leaves = _leaves("", shapes)
+    leaves = [leaf._replace(name=f"{leaf.name}_result") if leaf.name in used else leaf for leaf in leaves]
+    return _checked(leaves, "a result")
 
 
 def _leaves(name: str, tree: Any) -> list[Leaf]:
     leaves = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
-        whole = "_".join(filter(None, (name, jax.tree_util.keystr(path, simple=True, separator="_"))))
+        whole = "_".join(filter(None, (name, jax.tree_util.keystr(path, simple=True, separator="_")))) or "result"
         whole = f"result_{whole}" if whole[:1].isdigit() else whole
         leaves.append(Leaf(whole, kind_of(jax.dtypes.canonicalize_dtype(leaf.dtype)), tuple(map(int, leaf.shape))))
     return leaves

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -103,10 +104,9 @@ def _call_converted(
         raise InputError(f"{name} takes {', '.join(leaf.name for leaf in leaves)}; got {len(arguments)} arguments")
     arrays = []
     for leaf, argument in zip(leaves, arguments, strict=True):
-        try:
+        array = np.asarray(None)
+        with suppress(ValueError, TypeError):
             array = np.asarray(argument)
-        except (ValueError, TypeError):
-            raise InputError(f"{leaf.name} is not an array; expected real numbers of shape {leaf.shape}") from None
         if array.dtype.kind not in ("fiub" if leaf.kind == "bool" else "fiu"):
             raise InputError(f"{leaf.name} has type {array.dtype}; expected real numbers of shape {leaf.shape}")
         require_shape(leaf.name, array.shape, leaf.shape)
@@ -162,7 +162,7 @@ PyObject *PyObject_Vectorcall(PyObject *, PyObject *const *, size_t, PyObject *)
 typedef struct {
     char format;
     int axes;
-    Py_ssize_t shape[$axes];
+    Py_ssize_t shape[64]; /* the most that NumPy has */
 } leaf;
 typedef struct {
     int arguments, results;
@@ -277,5 +277,5 @@ def _binding(name: str, signatures: Mapping[str, Signature], real: str, types: M
         methods += f'    {{"{key}", call_{number}, FAST, "{key}({takes}) -> {gives}"}},\n'
     return _BINDING.substitute(
         name=name, real=real, functions=functions, methods=methods, format=np.dtype(types["real"]).char,
-        axes=max([1, *(len(leaf.shape) for leaves in every for leaf in leaves)]), maximum=max([1, *map(len, every)]),
+        maximum=max([1, *map(len, every)]),
     )  # fmt: skip
