@@ -101,13 +101,9 @@ def functions_of_run(
     run = replace(run, model=model, description=description, parameters=jax.tree.map(convert, run.parameters))
     if isinstance(model, FunctionModel):
         derivatives = model.derivatives(run.parameters)
-
-        def first(count, x):
-            return derivatives(x)[:count]
-
         networks = {
-            "value": _named(partial(first, 1), "y"),
-            "value_and_jacobian": _named(partial(first, 2), "y", "jacobian"),
+            "value": _named(derivatives, "y"),
+            "value_and_jacobian": _named(derivatives, "y", "jacobian"),
             "value_jacobian_hessian": _named(derivatives, "y", "jacobian", "hessian"),
         }
         functions = _with_examples(networks, dtype, description["sizes"][0])
@@ -198,35 +194,41 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
         functions |= _with_derivatives("mass_matrix", mass_matrix, "M")
         if getattr(system, "dissipation", None) is not None:
             functions |= _with_derivatives("friction", motion.friction, "tau_friction")
-    rk4 = discrete.rk4(forward, actuation=actuation)
-    implicit = discrete.implicit_midpoint(forward, actuation=actuation, iterations=iterations)
-    return functions | _steps("step", rk4, implicit, ("x_next",), ("A", "B"))
+    return functions | _steps(
+        ("x_next",),
+        ("A", "B"),
+        step_rk4=discrete.rk4(forward, actuation=actuation),
+        step_implicit_midpoint=discrete.implicit_midpoint(forward, actuation=actuation, iterations=iterations),
+    )
 
 
 def _of_flow(system: Flow | PlainFlow, iterations: int) -> Named:
     functions = _with_derivatives("rates", system.rates, "qd", "pd")
     if isinstance(system, Flow):
         functions |= _with_derivatives("hamiltonian", system.energy, "H")
-    implicit = discrete.phase_implicit_midpoint(system.rates, iterations=iterations)
-    slopes = ("q_next_q", "q_next_p", "p_next_q", "p_next_p")
-    return functions | _steps("phase_step", discrete.phase_rk4(system.rates), implicit, ("q_next", "p_next"), slopes)
+    return functions | _steps(
+        ("q_next", "p_next"),
+        ("q_next_q", "q_next_p", "p_next_q", "p_next_p"),
+        phase_step_rk4=discrete.phase_rk4(system.rates),
+        phase_step_implicit_midpoint=discrete.phase_implicit_midpoint(system.rates, iterations=iterations),
+    )
 
 
-def _steps(prefix: str, rk4: Function, implicit: Function, results: Sequence[str], slopes: Sequence[str]) -> Named:
+def _steps(results: Sequence[str], slopes: Sequence[str], **steps: Function) -> Named:
     functions: Named = {}
-    for name, step in ((f"{prefix}_rk4", rk4), (f"{prefix}_implicit_midpoint", implicit)):
+    for name, step in steps.items():
         functions[name] = _named(step, *results)
         functions[f"{name}_jacobian"] = _named(discrete.linearised(step), *results, *slopes)
     return functions
 
 
 def _named(function: Function, *results: str, like: Function | None = None) -> Function:
-    """Returns the function with named results, and with the parameters of another."""
+    """Returns the function with its first results, named, and with the parameters of another."""
 
     @functools.wraps(like or function)
     def call(*state):
         # JAX sorts the keys of a plain dictionary, and keeps the order of this one.
-        return OrderedDict(zip(results, jax.tree.leaves(function(*state)), strict=True))
+        return OrderedDict(zip(results, jax.tree.leaves(function(*state)), strict=False))
 
     return call
 

@@ -16,9 +16,7 @@ from dln_jax.types import InputError
 
 FORMAT = 6
 """Version of the names and signatures in exported sources and of the JSON description."""
-AGAIN = "export it again"
 Function = Callable[..., Any]
-KINDS = {kind: c for kind, c in C_TYPES.items() if kind != "index"}
 
 
 class Leaf(NamedTuple):
@@ -107,7 +105,7 @@ def _checked(leaves: list[Leaf], what: str) -> list[Leaf]:
 
 def declaration(name: str, function: str, signature: Signature, real: str) -> str:
     """Returns the prototype of a function, without the semicolon."""
-    kinds = {**KINDS, "real": real}
+    kinds = {**C_TYPES, "real": real}
 
     def array(leaf: Leaf) -> str:
         return f"{kinds[leaf.kind]} {leaf.name}[{max(prod(leaf.shape), 1)}]"  # C has no empty arrays
@@ -155,15 +153,17 @@ def read_interface(directory: Path, name: str) -> tuple[str, dict[str, Signature
         InputError: a file is missing or altered, or the format differs.
     """
     path = directory / f"{name}.json"
-    stated = read_json(path, remedy=f"{AGAIN}, and keep its files together")
+    stated = read_json(path, remedy="export it again, and keep its files together")
     if stated.get("format") != FORMAT:
-        raise InputError(f"{path}: C format {stated.get('format')!r}; this release reads format {FORMAT}, so {AGAIN}")
+        raise InputError(
+            f"{path}: C format {stated.get('format')!r}; this release reads format {FORMAT}, so export it again"
+        )
     try:
         files = {file.name: file.read_bytes() for file in (path.with_suffix(".h"), path.with_suffix(".c"))}
     except OSError as error:
-        raise InputError(f"{error.filename}: cannot be read ({error.strerror}); {AGAIN}") from error
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror}); export it again") from error
     if stated.pop("digest", None) != _digest(stated, *files.values()) or stated["name"] != name:
-        raise InputError(f"{path}: it, {name}.h or {name}.c is altered, renamed or of another export; {AGAIN}")
+        raise InputError(f"{path}: it, {name}.h or {name}.c is altered, renamed or of another export; export it again")
     signatures = {}
     for key, values in stated["functions"].items():
         arguments, results = (

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from dln_jax.export.c.interface import KINDS, Function, Leaf, Signature, read_interface
-from dln_jax.export.c.text import NUMPY_TYPES, PRECISIONS, UNSIGNED, check_name
+from dln_jax.export.c.interface import Function, Leaf, Signature, read_interface
+from dln_jax.export.c.text import C_TYPES, NUMPY_TYPES, PRECISIONS, UNSIGNED, check_name
 from dln_jax.mechanics.arguments import require_shape
 from dln_jax.types import InputError
 
@@ -257,7 +257,7 @@ def _binding(name: str, signatures: Mapping[str, Signature], real: str, types: M
         passed = [f"memory[{k}]" for k in range(len(leaves))]
         for k, leaf in enumerate(signature.arguments):
             if not leaf.shape:
-                passed[k] = f"*(const {KINDS[leaf.kind]} *){passed[k]}"
+                passed[k] = f"*(const {C_TYPES[leaf.kind]} *){passed[k]}"
         call = f"{name}_{key}({', '.join(passed)})"
         if not signature.returns:
             call = f"{call};\n    return NULL;"

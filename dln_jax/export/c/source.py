@@ -97,8 +97,8 @@ def export_c(
         )  # fmt: skip
     if precision is None:
         types = [leaf.dtype for leaf in jax.tree.leaves([examples for _, examples in chosen.values()])]
-        sizes = [dtype.itemsize for dtype in types if jax.numpy.issubdtype(dtype, np.floating)]
-        precision = "f64" if max(sizes, default=8) == 8 else "f32"
+        sizes = {dtype.itemsize for dtype in types if jax.numpy.issubdtype(dtype, np.floating)}
+        precision = "f32" if sizes == {4} else "f64"
     require_precision(precision)
     if casadi and precision != "f64":
         raise InputError("CasADi computes in double; export with precision f64")

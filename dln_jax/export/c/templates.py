@@ -5,8 +5,8 @@ from math import prod
 
 from dln_jax.export.c import elementary, factorisations, kernels, operations
 from dln_jax.export.c.body import Source
-from dln_jax.export.c.interface import KINDS, Cost, Signature, declaration
-from dln_jax.export.c.text import PRECISIONS, comment, fill, table
+from dln_jax.export.c.interface import Cost, Signature, declaration
+from dln_jax.export.c.text import C_TYPES, PRECISIONS, comment, fill, table
 
 _PROMISES = """Functions of one state. Their workspace is on the stack, so they may run in several threads.
 Results may overlap arguments, as updates in place do, but not each other: all arguments are read before results are
@@ -117,7 +117,7 @@ def demo(name: str, functions: Mapping[str, Signature], precision: str) -> str:
         names = [leaf.name if leaf.shape else f"{leaf.name}[0]" for leaf in leaves]
         call = f"{name}_{key}({', '.join(names[: len(names) - function.returns])})"
         call = f"{names[-1]} = {call}" if function.returns else call
-        lines = [f"static {KINDS[leaf.kind]} {leaf.name}[{max(prod(leaf.shape), 1)}];" for leaf in leaves]
+        lines = [f"static {C_TYPES[leaf.kind]} {leaf.name}[{max(prod(leaf.shape), 1)}];" for leaf in leaves]
         change = "(void)0"
         for leaf in reversed(function.arguments):
             value = "0"
