@@ -22,7 +22,8 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import accumulate, pairwise, takewhile
-from typing import Any, NamedTuple
+from math import prod
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +33,7 @@ from jax.flatten_util import ravel_pytree
 
 from dln_jax.export.c.body import Source
 from dln_jax.export.c.emit import body_of
-from dln_jax.export.c.interface import Function, Leaf, argument_leaves, result_leaves
+from dln_jax.export.c.interface import Function, Leaf, signature_of
 from dln_jax.export.c.jaxprs import traced
 from dln_jax.export.c.lowering import program_of
 from dln_jax.export.c.templates import stated
@@ -92,20 +93,6 @@ endif()
 """
 
 
-class Block(NamedTuple):
-    """An input or output: a dense matrix, or one declared without elements."""
-
-    name: str
-    rows: int
-    columns: int
-    dense: bool = True
-
-    @property
-    def size(self) -> int:
-        """Number of elements of the matrix."""
-        return self.rows * self.columns
-
-
 def external_functions(
     name: str, functions: Mapping[str, Any], source: Source, *, stack: int, leave_out: bool = False
 ) -> tuple[Source, str, list[str]]:
@@ -126,12 +113,11 @@ def external_functions(
         symbol, prefix = f"casadi_{name}_{key}", ""
         written, kept = "", source
         try:
-            arguments = argument_leaves(function, examples)
-            results = result_leaves(jax.eval_shape(function, *examples), arguments)
-            if not arguments:
+            signature = signature_of(function, examples, jax.eval_shape(function, *examples))
+            inputs, outputs = ([_matrix(leaf) for leaf in leaves] for leaves in signature[:2])
+            if not inputs:
                 raise InputError("there are no arguments to differentiate with respect to; export it without casadi")
-            inputs, outputs = ([_block(leaf) for leaf in leaves] for leaves in (arguments, results))
-            names = [start + leaf.name for start in ("", "out_", "adj_", "fwd_") for leaf in [*arguments, *results]]
+            names = [start + leaf.name for start in ("", "out_", "adj_", "fwd_") for leaf in [*inputs, *outputs]]
             for word in (symbol, *names):
                 if re.search("__|_$", word) or word in ("null", "jac", "hess") or names.count(word) > 1:
                     raise InputError(f"CasADi has no such name as {word}, or derivatives have it too; choose another")
@@ -139,7 +125,7 @@ def external_functions(
             for prefix, (before, after, ways) in symbols.items():
                 kept, more = _function(kept, prefix + symbol, before, after, ways, stack)
                 written += more
-                largest = max(largest, *(block.size for block in before if block.dense))
+                largest = max(largest, *(prod(leaf.shape) for leaf in before if leaf.kind))
         except InputError as error:
             reason = f"{prefix}{symbol}: {error}"
             if not leave_out:
@@ -150,14 +136,13 @@ def external_functions(
     return source, f"{_DECLARATIONS}\nstatic const casadi_real zeros[{largest}] = {{0}};\n{text}", left_out
 
 
-def _block(leaf: Leaf) -> Block:
+def _matrix(leaf: Leaf) -> Leaf:
     if leaf.kind != "real" or len(leaf.shape) > 2 or 0 in leaf.shape:
         raise InputError(
             f"{leaf.name} is {leaf.kind} of shape {list(leaf.shape)}; CasADi takes real numbers of at most two axes, "
             "none of them empty, so export it without casadi"
         )
-    rows, columns = (*leaf.shape, 1, 1)[:2]
-    return Block(leaf.name, rows, columns)
+    return leaf._replace(shape=(*leaf.shape, 1, 1)[:2])
 
 
 def _flat(function: Function, examples: Sequence[Any]) -> Flat:
@@ -190,12 +175,12 @@ def _reverse(function: Flat, x: Array) -> Array:
 
 
 def _derivatives(
-    inputs: list[Block], outputs: list[Block], flat: Flat
-) -> dict[str, tuple[list[Block], list[Block], list[Way]]]:
+    inputs: list[Leaf], outputs: list[Leaf], flat: Flat
+) -> dict[str, tuple[list[Leaf], list[Leaf], list[Way]]]:
     """Returns prefix -> inputs, outputs, and functions that compute them, the cheapest first."""
     x_parts, y_parts = (
-        [slice(*ends) for ends in pairwise(accumulate((block.size for block in blocks), initial=0))]
-        for blocks in (inputs, outputs)
+        [slice(*ends) for ends in pairwise(accumulate((prod(leaf.shape) for leaf in leaves), initial=0))]
+        for leaves in (inputs, outputs)
     )
 
     def split(vector, parts):
@@ -224,12 +209,14 @@ def _derivatives(
         rows = ([*(hessian[k, i] for k in x_parts), *(by_seeds[i, j].T for j in y_parts)] for i in x_parts)
         return [block for row in rows for block in row]
 
-    def renamed(prefix, blocks):
-        return [block._replace(name=f"{prefix}_{block.name}", dense=prefix != "out") for block in blocks]
+    def renamed(prefix, leaves):
+        # CasADi declares copies of outputs, and derivatives with respect to them, without elements: of no kind.
+        kind = "" if prefix == "out" else "real"
+        return [leaf._replace(name=f"{prefix}_{leaf.name}", kind=kind) for leaf in leaves]
 
     def jacobians(results, variables):
         return [
-            Block(f"jac_{result.name}_{variable.name}", result.size, variable.size, variable.dense)
+            Leaf(f"jac_{result.name}_{variable.name}", variable.kind, (prod(result.shape), prod(variable.shape)))
             for result in results
             for variable in variables
         ]
@@ -254,13 +241,13 @@ def _derivatives(
 
 
 def _function(
-    source: Source, symbol: str, inputs: list[Block], outputs: list[Block], ways: Sequence[Way], stack: int
+    source: Source, symbol: str, inputs: list[Leaf], outputs: list[Leaf], ways: Sequence[Way], stack: int
 ) -> tuple[Source, str]:
     """Returns the source and the C text from the first method that can be compiled."""
-    dense = [k for k, block in enumerate(inputs) if block.dense]
-    n = sum(block.size for block in takewhile(lambda block: block.dense, inputs))
+    dense = [k for k, leaf in enumerate(inputs) if leaf.kind]
+    n = sum(prod(leaf.shape) for leaf in takewhile(lambda leaf: leaf.kind, inputs))
     names = {place: (f"in_{k}", False) for place, k in enumerate(dense)}
-    targets = [f"res[{j}]" for j, output in enumerate(outputs) if output.dense]
+    targets = [f"res[{j}]" for j, leaf in enumerate(outputs) if leaf.kind]
     reason = ""
 
     def evaluate(way, *columns):
@@ -268,7 +255,7 @@ def _function(
 
     for way in ways:
         try:
-            closed, _ = traced(partial(evaluate, way), [np.zeros(inputs[k].size) for k in dense])
+            closed, _ = traced(partial(evaluate, way), [np.zeros(prod(inputs[k].shape)) for k in dense])
             program, arguments, results = program_of(closed, finite=source.finite)
             body = body_of(source.copy(), program, results, names, targets, optional=True)
         except (TypeError, ValueError, NotImplementedError) as error:  # JAX cannot differentiate it, or it has no C
@@ -281,12 +268,12 @@ def _function(
         used = [k for k, node in zip(dense, arguments, strict=True) if body.uses(node)]
         lines = [f"    const casadi_real *in_{k} = arg[{k}] ? arg[{k}] : zeros;" for k in used]
         lines += ["    (void)arg; (void)integers; (void)reals; (void)memory;", *body.lines, "    return 0;"]
-        blocks = [*inputs, *outputs]
+        leaves = [*inputs, *outputs]
         return body.source, _FUNCTION.format(
             symbol=symbol,
-            names=", ".join(f'"{block.name}"' for block in blocks),
-            length=3 + max(0 if block.dense else block.columns for block in blocks),
-            sparsities=", ".join(f"{{{block.rows}, {block.columns}, {int(block.dense)}}}" for block in blocks),
+            names=", ".join(f'"{leaf.name}"' for leaf in leaves),
+            length=3 + max(0 if leaf.kind else leaf.shape[1] for leaf in leaves),
+            sparsities=", ".join(f"{{{leaf.shape[0]}, {leaf.shape[1]}, {int(leaf.kind != '')}}}" for leaf in leaves),
             cost=stated(body.cost), inputs=len(inputs), outputs=len(outputs),
             lines="\n".join(lines),
         )  # fmt: skip

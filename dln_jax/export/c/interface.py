@@ -68,23 +68,25 @@ class Signature(NamedTuple):
         return () if self.returns else self.results
 
 
-def argument_leaves(function: Function, examples: Sequence[Any]) -> list[Leaf]:
-    """Returns the argument arrays, named after the function's parameters and, in a tree, the path of the leaf."""
+def signature_of(function: Function, examples: Sequence[Any], shapes: Any) -> Signature:
+    """Returns the signature of a function, without costs, from example arguments and the shapes of its results.
+
+    Arguments are named after the function's parameters, results after their keys, or `result` if there are none. Leaves
+    of a tree have the path of the leaf too.
+    """
     try:
         names = list(inspect.signature(function).parameters)
     except (ValueError, TypeError):
         names = []
     names += [f"argument_{k}" for k in range(len(names), len(examples))]
-    leaves = [leaf for name, example in zip(names, examples, strict=False) for leaf in _leaves(name, example)]
-    return _checked(leaves, "an argument")
-
-
-def result_leaves(shapes: Any, taken: Sequence[Leaf]) -> list[Leaf]:
-    """Returns the result arrays, named after their keys, or `result` if there are none."""
-    used = {leaf.name for leaf in taken}
-    leaves = _leaves("", shapes)
-    leaves = [leaf._replace(name=f"{leaf.name}_result") if leaf.name in used else leaf for leaf in leaves]
-    return _checked(leaves, "a result")
+    arguments = [leaf for name, example in zip(names, examples, strict=False) for leaf in _leaves(name, example)]
+    used = {leaf.name for leaf in arguments}
+    results = [leaf._replace(name=f"{leaf.name}_result") if leaf.name in used else leaf for leaf in _leaves("", shapes)]
+    for what, leaves in (("an argument", arguments), ("a result", results)):
+        names = [check_name(leaf.name, f"the name of {what}") for leaf in leaves]
+        if len(set(names)) < len(names):
+            raise InputError(f"two {what.split()[1]}s have one name among {', '.join(names)}; rename one")
+    return Signature(tuple(arguments), tuple(results))
 
 
 def _leaves(name: str, tree: Any) -> list[Leaf]:
@@ -93,13 +95,6 @@ def _leaves(name: str, tree: Any) -> list[Leaf]:
         whole = "_".join(filter(None, (name, jax.tree_util.keystr(path, simple=True, separator="_")))) or "result"
         whole = f"result_{whole}" if whole[:1].isdigit() else whole
         leaves.append(Leaf(whole, kind_of(jax.dtypes.canonicalize_dtype(leaf.dtype)), tuple(map(int, leaf.shape))))
-    return leaves
-
-
-def _checked(leaves: list[Leaf], what: str) -> list[Leaf]:
-    names = [check_name(leaf.name, f"the name of {what}") for leaf in leaves]
-    if len(set(names)) < len(names):
-        raise InputError(f"two {what.split()[1]}s have one name among {', '.join(names)}; rename one")
     return leaves
 
 

@@ -23,10 +23,9 @@ from dln_jax.export.c.interface import (
     FORMAT,
     Function,
     Signature,
-    argument_leaves,
     declaration,
     description,
-    result_leaves,
+    signature_of,
 )
 from dln_jax.export.c.jaxprs import repeated_calls, traced
 from dln_jax.export.c.lowering import program_of
@@ -172,9 +171,8 @@ def _traced(key: str, function: Function, examples: Any, precision: str) -> tupl
     real = PRECISIONS[precision][0]
     try:
         examples = jax.tree.map(lambda x: np.asarray(x, real if kind_of(x.dtype) == "real" else None), examples)
-        arguments = argument_leaves(function, examples)
         closed, shapes = traced(function, examples)
-        return Signature(tuple(arguments), tuple(result_leaves(shapes, arguments))), closed
+        return signature_of(function, examples, shapes), closed
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
 
