@@ -90,17 +90,12 @@ def functions_of_run(
         model = build(description)
     dtype = data_type(description["precision"])
 
-    def convert(leaf):
-        converted = leaf.astype(dtype)
-        if not (finite := jnp.isfinite(converted)).all():
-            raise InputError(
-                f"a parameter is {leaf[~finite][0]}, which {dtype.__name__} cannot hold; train again, or export in f64"
-            )
-        return converted
-
-    run = replace(run, model=model, description=description, parameters=jax.tree.map(convert, run.parameters))
+    parameters = jax.tree.map(lambda leaf: leaf.astype(dtype), run.parameters)
+    if not all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(parameters)):
+        raise InputError(f"the model has a parameter which {dtype.__name__} cannot hold; train again, or export in f64")
+    run = replace(run, model=model, description=description, parameters=parameters)
     if isinstance(model, FunctionModel):
-        derivatives = model.derivatives(run.parameters)
+        derivatives = model.derivatives(parameters)
         networks = {
             "value": _named(derivatives, "y"),
             "value_and_jacobian": _named(derivatives, "y", "jacobian"),
@@ -108,7 +103,7 @@ def functions_of_run(
         }
         functions = _with_examples(networks, dtype, description["sizes"][0])
     elif isinstance(model, ImageModel):
-        images = model.images(run.parameters)
+        images = model.images(parameters)
         networks = {"encode": _named(images.encode, "q", "p"), "decode": _named(images.decode, "frames")}
         networks |= _of_flow(images.field, iterations)
         functions = _with_examples(networks, dtype, 1, frames=(2 * description["pixels"],))

@@ -113,6 +113,7 @@ def external_functions(
         symbol, prefix = f"casadi_{name}_{key}", ""
         written, kept = "", source
         try:
+            examples = jax.eval_shape(lambda *leaves: leaves, *examples)
             signature = signature_of(function, examples, jax.eval_shape(function, *examples))
             inputs, outputs = ([_matrix(leaf) for leaf in leaves] for leaves in signature[:2])
             if not inputs:
@@ -130,7 +131,7 @@ def external_functions(
             reason = f"{prefix}{symbol}: {error}"
             if not leave_out:
                 raise InputError(reason) from error
-            left_out.append(reason)
+            left_out.append(f"Left out: {reason}")
             continue
         source, text = kept, text + written
     return source, f"{_DECLARATIONS}\nstatic const casadi_real zeros[{largest}] = {{0}};\n{text}", left_out
@@ -147,9 +148,9 @@ def _matrix(leaf: Leaf) -> Leaf:
 
 def _flat(function: Function, examples: Sequence[Any]) -> Flat:
     """Returns the function from all inputs to all outputs, as column-major vectors end to end."""
-    leaves, tree = jax.tree.flatten(tuple(examples))
+    leaves, tree = jax.tree.flatten(examples)
     # Column-major order of a matrix is row-major order of its transpose.
-    _, parts_of = ravel_pytree([jnp.asarray(leaf).T for leaf in leaves])
+    _, parts_of = ravel_pytree([np.zeros(leaf.shape[::-1]) for leaf in leaves])
 
     def flat(x):
         results = jax.tree.leaves(function(*jax.tree.unflatten(tree, [part.T for part in parts_of(x)])))

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from dln_jax.export.c.interface import Function, Leaf, Signature, read_interface
-from dln_jax.export.c.text import C_TYPES, NUMPY_TYPES, PRECISIONS, UNSIGNED, check_name
+from dln_jax.export.c.text import C_TYPES, NUMPY_TYPES, PRECISIONS, check_name
 from dln_jax.mechanics.arguments import require_shape
 from dln_jax.types import InputError
 
@@ -159,6 +159,13 @@ PyObject *PyTuple_New(Py_ssize_t);
 int PyTuple_SetItem(PyObject *, Py_ssize_t, PyObject *);
 PyObject *PyObject_Vectorcall(PyObject *, PyObject *const *, size_t, PyObject *);
 
+#define GIVES_real(x) PyFloat_FromDouble((double)x)
+#define GIVES_bool(x) PyLong_FromLongLong(x)
+#define GIVES_int(x) PyLong_FromLongLong(x)
+#define GIVES_long(x) PyLong_FromLongLong(x)
+#define GIVES_unsigned(x) PyLong_FromUnsignedLongLong(x)
+#define GIVES_unsigned_long(x) PyLong_FromUnsignedLongLong(x)
+
 typedef struct {
     char format;
     int axes;
@@ -259,13 +266,10 @@ def _binding(name: str, signatures: Mapping[str, Signature], real: str, types: M
             if not leaf.shape:
                 passed[k] = f"*(const {C_TYPES[leaf.kind]} *){passed[k]}"
         call = f"{name}_{key}({', '.join(passed)})"
-        if not signature.returns:
-            call = f"{call};\n    return NULL;"
-        elif signature.results[0].kind == "real":
-            call = f"return PyFloat_FromDouble((double){call});"
+        if signature.returns:
+            call = f"return GIVES_{signature.results[0].kind}({call});"
         else:
-            unsigned = "UnsignedLongLong" if signature.results[0].kind in UNSIGNED else "LongLong"
-            call = f"return PyLong_From{unsigned}({call});"
+            call = f"{call};\n    return NULL;"
         described = [
             f"{{'{np.dtype(types[leaf.kind]).char}', {len(leaf.shape)}, {{{', '.join(map(str, leaf.shape or (0,)))}}}}}"
             for leaf in leaves

@@ -9,7 +9,6 @@ import importlib.metadata
 import re
 from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +28,9 @@ from dln_jax.export.c.interface import (
 )
 from dln_jax.export.c.jaxprs import repeated_calls, traced
 from dln_jax.export.c.lowering import program_of
-from dln_jax.export.c.templates import NEEDED, about, cmake, demo, header, preamble
+from dln_jax.export.c.templates import NEEDED, cmake, demo, header, preamble
 from dln_jax.export.c.text import PRECISIONS, check_name, comment, kind_of
-from dln_jax.files import read_json, write_bytes
+from dln_jax.files import write_bytes
 from dln_jax.precision import computing_in, require_precision
 from dln_jax.types import InputError, require_positive
 
@@ -91,11 +90,9 @@ def export_c(
             raise InputError(
                 f"{key} is {pair!r:.60}; expected (function, examples), one example for each argument: (f, (x,))"
             )
-        chosen[check_name(key, "the name of a function")] = (
-            _in_written_order(pair[0]), jax.tree.map(_array, tuple(pair[1]))
-        )  # fmt: skip
+        chosen[check_name(key, "the name of a function")] = _in_written_order(pair[0]), tuple(pair[1])
     if precision is None:
-        types = [leaf.dtype for leaf in jax.tree.leaves([examples for _, examples in chosen.values()])]
+        types = [_dtype(leaf) for leaf in jax.tree.leaves([examples for _, examples in chosen.values()])]
         sizes = {dtype.itemsize for dtype in types if jax.numpy.issubdtype(dtype, np.floating)}
         precision = "f32" if sizes == {4} else "f64"
     require_precision(precision)
@@ -123,7 +120,7 @@ def export_c(
                 continue
             else:
                 large = f"{key}, of {lines} lines"
-            left_out.append(f"{large}; ask for it by name.")
+            left_out.append(f"Left out: {large}; ask for it by name.")
         parts = dict.fromkeys(part.text for part in source.parts.values())
         files = {
             f"{name}.h": header(name, written_by, signatures, precision, left_out),
@@ -136,7 +133,7 @@ def export_c(
             source, text, left_out = external.external_functions(
                 name, of_casadi, empty, stack=stack, leave_out=leave_out_large
             )
-            title = about(external.ABOUT.format(name=name, written_by=written_by), left_out=left_out)
+            title = comment(external.ABOUT.format(name=name, written_by=written_by), *left_out)
             files[f"{name}_casadi.c"] = title + preamble(source, name) + text
             files["CMakeLists.txt"] += external.BUILD.format(name=name)
     if (longest := max(map(len, files.values()))) > LENGTH:
@@ -146,11 +143,8 @@ def export_c(
     return _write(Path(directory), {**encoded, f"{name}.json": stated}, overwrite=overwrite)
 
 
-def _array(leaf: Any) -> Any:
-    """Returns an array, a number as an array, or zeros for a shape."""
-    if isinstance(leaf, jax.ShapeDtypeStruct):
-        return np.zeros(leaf.shape, leaf.dtype)
-    return leaf if hasattr(leaf, "dtype") else np.asarray(leaf)
+def _dtype(leaf: Any) -> np.dtype:
+    return leaf.dtype if hasattr(leaf, "dtype") else np.dtype(type(leaf))
 
 
 def _in_written_order(function: Function) -> Function:
@@ -168,9 +162,13 @@ def _in_written_order(function: Function) -> Function:
 
 def _traced(key: str, function: Function, examples: Any, precision: str) -> tuple[Signature, Any]:
     """Returns the signature, without costs, and the closed jaxpr of a function."""
-    real = PRECISIONS[precision][0]
+
+    def shape_of(leaf):
+        dtype = PRECISIONS[precision][0] if kind_of(_dtype(leaf)) == "real" else _dtype(leaf)
+        return jax.ShapeDtypeStruct(np.shape(leaf), dtype)
+
     try:
-        examples = jax.tree.map(lambda x: np.asarray(x, real if kind_of(x.dtype) == "real" else None), examples)
+        examples = jax.tree.map(shape_of, examples)
         closed, shapes = traced(function, examples)
         return signature_of(function, examples, shapes), closed
     except InputError as error:
@@ -198,13 +196,11 @@ def _function(
 
 def _write(directory: Path, files: Mapping[str, bytes], *, overwrite: bool) -> list[Path]:
     """Writes the files, the description last: an interrupted export differs from its digest, which `load_c` refuses."""
-    for path in directory.glob("*.json"):
-        stated: Mapping[str, Any] = {}
-        with suppress(InputError):
-            stated = read_json(path, remedy="")
-        if "tensor_file" in stated:
+    for path in filter(Path.is_file, directory.glob("*.json")):
+        text = path.read_bytes()
+        if b'"tensor_file"' in text:
             raise InputError(f"{directory} is the folder of a run; export to another, such as {directory / 'exported'}")
-        if path.name in files and "functions" not in stated:
+        if path.name in files and b'"functions"' not in text:
             raise InputError(f"{path} describes no export; choose another folder or name")
     existing = [directory / name for name in files if (directory / name).exists()]
     for path in existing:

@@ -186,11 +186,10 @@ def header(
     """Returns the header: the prototype of every function, the shapes of its results and its cost."""
     declared = ""
     for key, signature in signatures.items():
-        shapes = ", ".join(leaf.described for leaf in signature.results if leaf.shape)
-        facts = stated(signature.cost)
+        results = ", ".join(leaf.described for leaf in signature.results)
         prototype = declaration(name, key, signature, PRECISIONS[precision][1])
-        declared += f"\n/* {f'{shapes}; ' if shapes else ''}{facts} */\n{prototype};\n"
-    text = about(f"{name}.h", written_by, _PROMISES, left_out=left_out)
+        declared += f"\n/* {results}; {stated(signature.cost)} */\n{prototype};\n"
+    text = comment(f"{name}.h", written_by, _PROMISES, *left_out)
     return text + fill(_HEADER, precision, guard=f"{name.upper()}_H", declared=declared)
 
 
@@ -201,9 +200,3 @@ def stated(cost: Cost) -> str:
     kinds += [f"unbounded loops, with one iteration counted {cost.unbounded_loops}"] * bool(cost.unbounded_loops)
     text = f"at most {cost.operations} floating-point operations, {cost.stack_bytes} bytes of stack"
     return text + f"\n   ({', '.join(kinds)})" * bool(kinds)
-
-
-def about(*paragraphs: str, left_out: Sequence[str]) -> str:
-    """Returns a comment that also lists the functions left out, with reasons."""
-    absent = "\n".join(f"Left out: {reason}" for reason in left_out)
-    return comment(*paragraphs, *[absent] * bool(absent))
