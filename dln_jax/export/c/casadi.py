@@ -257,7 +257,7 @@ def _function(
     for way in ways:
         try:
             closed, _ = traced(partial(evaluate, way), [np.zeros(prod(inputs[k].shape)) for k in dense])
-            program, arguments, results = program_of(closed, finite=source.finite)
+            program, _, results = program_of(closed, finite=source.finite)
             body = body_of(source.copy(), program, results, names, targets, optional=True)
         except (TypeError, ValueError, NotImplementedError) as error:  # JAX cannot differentiate it, or it has no C
             reason = str(error).strip().partition("\n")[0]
@@ -266,9 +266,9 @@ def _function(
             kib = body.stack / 1024
             reason = f"it would take {kib:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB"
             continue
-        used = [k for k, node in zip(dense, arguments, strict=True) if body.uses(node)]
-        lines = [f"    const casadi_real *in_{k} = arg[{k}] ? arg[{k}] : zeros;" for k in used]
-        lines += ["    (void)arg; (void)integers; (void)reals; (void)memory;", *body.lines, "    return 0;"]
+        lines = [f"    const casadi_real *in_{k} = arg[{k}] ? arg[{k}] : zeros;" for k in dense]
+        lines += [f"    (void)in_{k};" for k in dense]
+        lines += ["    (void)res; (void)integers; (void)reals; (void)memory;", *body.lines, "    return 0;"]
         leaves = [*inputs, *outputs]
         return body.source, _FUNCTION.format(
             symbol=symbol,

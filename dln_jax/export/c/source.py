@@ -6,7 +6,6 @@ no library but <math.h>. The same functions, name and precision give the same fi
 
 import functools
 import importlib.metadata
-import re
 from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -186,9 +185,8 @@ def _function(
         body = body_of(source, program, results, named, targets)
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
-    words = set(re.findall(r"\w+", "\n".join(body.lines)))
-    leaves = [*signature.arguments, *signature.written]
-    lines = "\n".join([*(f"    (void){leaf.name};" for leaf in leaves if leaf.name not in words), *body.lines])
+    unused = [f"    (void){leaf.name};" for leaf in (*signature.arguments, *signature.written)]
+    lines = "\n".join([*unused, *body.lines])
     text = f"\n{declaration(name, key, signature, 'real')}\n{{\n{lines}\n}}\n"
     total = len(body.lines) + sum(source.parts[part].text.count("\n") for part in body.calls)
     return signature._replace(cost=body.cost), text, total
