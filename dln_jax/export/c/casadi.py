@@ -266,8 +266,7 @@ def _function(
             kib = body.stack / 1024
             reason = f"it would take {kib:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB"
             continue
-        lines = [f"    const casadi_real *in_{k} = arg[{k}] ? arg[{k}] : zeros;" for k in dense]
-        lines += [f"    (void)in_{k};" for k in dense]
+        lines = [f"    const casadi_real *in_{k} = arg[{k}] ? arg[{k}] : zeros; (void)in_{k};" for k in dense]
         lines += ["    (void)res; (void)integers; (void)reals; (void)memory;", *body.lines, "    return 0;"]
         leaves = [*inputs, *outputs]
         return body.source, _FUNCTION.format(

@@ -60,7 +60,7 @@ class Signature(NamedTuple):
     @property
     def returns(self) -> bool:
         """Whether the function returns its only result, a scalar, instead of writing to an array."""
-        return len(self.results) == 1 and self.results[0].shape == ()
+        return [leaf.shape for leaf in self.results] == [()]
 
     @property
     def written(self) -> tuple[Leaf, ...]:

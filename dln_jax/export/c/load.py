@@ -258,13 +258,14 @@ static PyObject *call_$number(PyObject *self, PyObject *const *arguments, Py_ssi
 def _binding(name: str, signatures: Mapping[str, Signature], real: str, types: Mapping[str, DTypeLike]) -> str:
     """Returns the source of the binding, which is compiled together with the export."""
     functions = methods = ""
-    every = [[*signature.arguments, *signature.written] for signature in signatures.values()]
-    for number, ((key, signature), leaves) in enumerate(zip(signatures.items(), every, strict=True)):
-        count = len(signature.arguments)
-        passed = [f"memory[{k}]" for k in range(len(leaves))]
-        for k, leaf in enumerate(signature.arguments):
-            if not leaf.shape:
-                passed[k] = f"*(const {C_TYPES[leaf.kind]} *){passed[k]}"
+    maximum = 1
+    for number, (key, signature) in enumerate(signatures.items()):
+        leaves, count = [*signature.arguments, *signature.written], len(signature.arguments)
+        maximum = max(maximum, len(leaves))
+        passed = [
+            f"memory[{k}]" if leaf.shape or k >= count else f"*(const {C_TYPES[leaf.kind]} *)memory[{k}]"
+            for k, leaf in enumerate(leaves)
+        ]
         call = f"{name}_{key}({', '.join(passed)})"
         if signature.returns:
             call = f"return GIVES_{signature.results[0].kind}({call});"
@@ -281,5 +282,5 @@ def _binding(name: str, signatures: Mapping[str, Signature], real: str, types: M
         methods += f'    {{"{key}", call_{number}, FAST, "{key}({takes}) -> {gives}"}},\n'
     return _BINDING.substitute(
         name=name, real=real, functions=functions, methods=methods, format=np.dtype(types["real"]).char,
-        maximum=max([1, *map(len, every)]),
+        maximum=maximum,
     )  # fmt: skip

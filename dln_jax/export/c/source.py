@@ -91,9 +91,8 @@ def export_c(
             )
         chosen[check_name(key, "the name of a function")] = _in_written_order(pair[0]), tuple(pair[1])
     if precision is None:
-        types = [_dtype(leaf) for leaf in jax.tree.leaves([examples for _, examples in chosen.values()])]
-        sizes = {dtype.itemsize for dtype in types if jax.numpy.issubdtype(dtype, np.floating)}
-        precision = "f32" if sizes == {4} else "f64"
+        types = {str(_dtype(leaf)) for leaf in jax.tree.leaves([examples for _, examples in chosen.values()])}
+        precision = "f32" if "float32" in types and "float64" not in types else "f64"
     require_precision(precision)
     if casadi and precision != "f64":
         raise InputError("CasADi computes in double; export with precision f64")
@@ -111,14 +110,14 @@ def export_c(
             signature, text, lines = _function(with_function, name, key, signature, closed, repeated)
             if (used := signature.cost.stack_bytes) > stack:
                 large = f"{key} would take {used / 1024:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB"
-                if not leave_out_large:
-                    raise InputError(large)
-            elif not leave_out_large or lines <= LINES:
+            elif leave_out_large and lines > LINES:
+                large = f"{key}, of {lines} lines"
+            else:
                 source, signatures[key] = with_function, signature
                 texts.append(text)
                 continue
-            else:
-                large = f"{key}, of {lines} lines"
+            if not leave_out_large:
+                raise InputError(large)
             left_out.append(f"Left out: {large}; ask for it by name.")
         parts = dict.fromkeys(part.text for part in source.parts.values())
         files = {
@@ -149,11 +148,11 @@ def _dtype(leaf: Any) -> np.dtype:
 def _in_written_order(function: Function) -> Function:
     """Returns the function with its results in the order in which a dictionary was written; JAX would sort the keys."""
 
-    def ordered(tree: Any) -> Any:
+    def ordered(tree):
         return OrderedDict((key, ordered(value)) for key, value in tree.items()) if type(tree) is dict else tree
 
     @functools.wraps(function)
-    def call(*arguments: Any) -> Any:
+    def call(*arguments):
         return ordered(function(*arguments))
 
     return call
