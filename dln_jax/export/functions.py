@@ -38,7 +38,7 @@ from dln_jax.export.c.interface import Function
 from dln_jax.mechanics import discrete, jacobians
 from dln_jax.mechanics.discrete import ITERATIONS, Actuation
 from dln_jax.mechanics.dynamics import Dynamics, Flow, PhaseRates, PlainFlow
-from dln_jax.mechanics.equations import Canonical, Driven, System, dynamics, flow
+from dln_jax.mechanics.equations import Canonical, System, dynamics, flow
 from dln_jax.mechanics.jacobians import Natural
 from dln_jax.models.baselines import FunctionModel
 from dln_jax.models.latent_phase import ImageModel
@@ -77,17 +77,18 @@ def functions_of_run(
         InputError: the model lacks a named function or does not depend on temperature, the precision cannot hold a
             parameter, or a user-defined model has no needs or is exported in another precision than it was trained in.
     """
-    description, model = run.description, run.model
+    description = run.description
+    changes = {}
     if temperature is not None:
         if not np.any(description.get("cooling", 0.0)):
             raise InputError("the model does not depend on temperature; leave --temperature out")
-        description = {**description, "temperature": float(temperature)}
+        changes["temperature"] = float(temperature)
     if precision not in (None, description["precision"]):
         if description["name"] not in CATALOGUE:
             raise InputError(f"a user-defined model is exported in {description['precision']}, that of its training")
-        description = {**description, "precision": precision}
-    if description is not run.description:
-        model = build(description)
+        changes["precision"] = precision
+    description = {**description, **changes}
+    model = build(description) if changes else run.model
     dtype = data_type(description["precision"])
 
     parameters = jax.tree.map(lambda leaf: leaf.astype(dtype), run.parameters)
@@ -120,7 +121,7 @@ def functions_of_run(
                 "out_of_distribution": _named(run.out_of_distribution, "out_of_distribution"),
             }
             functions |= _with_examples(uncertain, dtype, d)
-    chosen = list(functions) if names is None else list(names)
+    chosen = functions if names is None else list(names)
     if unknown := [name for name in chosen if name not in functions]:
         raise InputError(
             f"a {description['name']} has no {', '.join(unknown)[:200]}; choose from {', '.join(functions)}"
@@ -144,14 +145,41 @@ def functions_of_system(
         iterations: Newton steps of the implicit midpoint rule, as for `mechanics.discrete.implicit_midpoint`.
     """
     d = degrees_of_freedom
+    rest = jnp.zeros_like
+    controls = d if actuation is None else np.shape(actuation)[1]
     # Networks take long to trace; jitted, they are traced once instead of once per function that contains them.
     traced = jax.tree.map(lambda leaf: jax.jit(leaf) if callable(leaf) else leaf, system)
+    link = getattr(traced, "link", traced)
     functions: Named = {}
-    if not isinstance(system, PhaseRates):
-        functions |= _of_dynamics(traced, d, actuation, iterations)
-    if isinstance(getattr(system, "link", system), Canonical | PhaseRates):
+    if not isinstance(traced, PhaseRates):
+        motion = dynamics(traced, degrees_of_freedom=d)
+        natural = isinstance(link, Natural)
+        forward, with_jacobians = jacobians.differentiable_forward_dynamics(traced, degrees_of_freedom=d)
+        of_inverse = partial(jacobians.inverse_dynamics_jacobians, traced)
+        of_coriolis = partial(jacobians.coriolis_jacobians, traced)
+
+        def coriolis(q, qd):
+            return motion.decompose(q, qd, rest(q)).coriolis
+
+        functions |= _with_derivatives("inverse_dynamics", motion.inverse_dynamics, "tau", slopes=of_inverse)
+        functions |= _with_derivatives("forward_dynamics", forward, "qdd", slopes=lambda *x: with_jacobians(*x)[1])
+        functions |= _with_derivatives("coriolis", coriolis, "c", slopes=of_coriolis)
+        if not natural or link.potential is not None:
+            functions |= _with_derivatives("gravity", lambda q: motion.decompose(q, rest(q), rest(q)).gravity, "g")
+        if isinstance(motion, Dynamics):
+            mass_matrix = (lambda q: motion.mass_matrix(q)) if natural else motion.mass_matrix
+            functions |= _with_derivatives("energy", motion.energy, "energy")
+            functions |= _with_derivatives("mass_matrix", mass_matrix, "M")
+            if getattr(traced, "dissipation", None) is not None:
+                functions |= _with_derivatives("friction", motion.friction, "tau_friction")
+        functions |= _steps(
+            ("x_next",),
+            ("A", "B"),
+            step_rk4=discrete.rk4(forward, actuation=actuation),
+            step_implicit_midpoint=discrete.implicit_midpoint(forward, actuation=actuation, iterations=iterations),
+        )
+    if isinstance(link, Canonical | PhaseRates):
         functions |= _of_flow(flow(traced, degrees_of_freedom=d), iterations)
-    controls = d if actuation is None else np.shape(actuation)[1]
     return _with_examples(functions, dtype, d, x=(2 * d,), u=(controls,))
 
 
@@ -165,36 +193,6 @@ def _with_examples(functions: Named, dtype: DTypeLike, size: int, **shapes: tupl
         )
         for name, function in functions.items()
     }
-
-
-def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) -> Named:
-    motion, rest = dynamics(system, degrees_of_freedom=d), jnp.zeros_like
-    forward, with_jacobians = jacobians.differentiable_forward_dynamics(system, degrees_of_freedom=d)
-    link = getattr(system, "link", system)
-    natural = isinstance(link, Natural)
-
-    def coriolis(q, qd):
-        return motion.decompose(q, qd, rest(q)).coriolis
-
-    of_inverse = partial(jacobians.inverse_dynamics_jacobians, system)
-    of_coriolis = partial(jacobians.coriolis_jacobians, system)
-    functions = _with_derivatives("inverse_dynamics", motion.inverse_dynamics, "tau", slopes=of_inverse)
-    functions |= _with_derivatives("forward_dynamics", forward, "qdd", slopes=lambda *state: with_jacobians(*state)[1])
-    functions |= _with_derivatives("coriolis", coriolis, "c", slopes=of_coriolis)
-    if not natural or link.potential is not None:
-        functions |= _with_derivatives("gravity", lambda q: motion.decompose(q, rest(q), rest(q)).gravity, "g")
-    if isinstance(motion, Dynamics):
-        mass_matrix = (lambda q: motion.mass_matrix(q)) if natural else motion.mass_matrix
-        functions |= _with_derivatives("energy", motion.energy, "energy")
-        functions |= _with_derivatives("mass_matrix", mass_matrix, "M")
-        if getattr(system, "dissipation", None) is not None:
-            functions |= _with_derivatives("friction", motion.friction, "tau_friction")
-    return functions | _steps(
-        ("x_next",),
-        ("A", "B"),
-        step_rk4=discrete.rk4(forward, actuation=actuation),
-        step_implicit_midpoint=discrete.implicit_midpoint(forward, actuation=actuation, iterations=iterations),
-    )
 
 
 def _of_flow(system: Flow | PlainFlow, iterations: int) -> Named:

@@ -110,8 +110,9 @@ def external_functions(
     """
     text, largest, left_out = "", 1, []
     for key, (function, examples) in functions.items():
-        symbol, prefix = f"casadi_{name}_{key}", ""
-        written, kept = "", source
+        symbol = f"casadi_{name}_{key}"
+        prefix = written = ""
+        kept = source
         try:
             examples = jax.eval_shape(lambda *leaves: leaves, *examples)
             signature = signature_of(function, examples, jax.eval_shape(function, *examples))

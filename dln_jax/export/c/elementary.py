@@ -346,6 +346,5 @@ def definitions(names: Iterable[str], precision: str, *, arrays: Iterable[str] =
         own += fill(_OWN[name] + each * (name in arrays), precision, name=name)
         library += fill(of_library + _EACH * (name in arrays), precision, name=name)
     if own:  # compilers warn about functions that nothing calls
-        unshared = "" if bits else helpers
-        own = f"\n#ifdef DLN_OWN_ELEMENTARY{unshared}{_EVALUATED}{own}\n#else\n{library}#endif\n"
-    return "".join([helpers if bits else "", *bits, own])
+        own = f"\n#ifdef DLN_OWN_ELEMENTARY{helpers * (not bits)}{_EVALUATED}{own}\n#else\n{library}#endif\n"
+    return "".join([helpers * bool(bits), *bits, own])

@@ -235,7 +235,8 @@ def _call(body: Body, node: Node) -> None:
     targets = [f"v{node.number}_{place}" for place in range(len(arrays))]
     for target, (kind, size) in zip(targets, arrays, strict=True):
         body.declared(target, kind, size)
-    targets += [body.kept(node)] if node.op != "lu" else []
+    if node.op != "lu":
+        targets.append(body.kept(node))
     values = [*sizes, *map(int, node.attribute or ()), *map(body.pointer, node.args), *targets]
     body.line(f"elementary_{node.op}({', '.join(map(str, values))});")
     body.spend(**_COSTS[node.op](*sizes))

@@ -12,7 +12,7 @@ import jax
 
 from dln_jax.export.c.text import C_TYPES, check_name, kind_of
 from dln_jax.files import read_json
-from dln_jax.types import InputError
+from dln_jax.types import InputError, require_once
 
 FORMAT = 6
 """Version of the names and signatures in exported sources and of the JSON description."""
@@ -82,10 +82,8 @@ def signature_of(function: Function, examples: Sequence[Any], shapes: Any) -> Si
     arguments = [leaf for name, example in zip(names, examples, strict=False) for leaf in _leaves(name, example)]
     used = {leaf.name for leaf in arguments}
     results = [leaf._replace(name=f"{leaf.name}_result") if leaf.name in used else leaf for leaf in _leaves("", shapes)]
-    for what, leaves in (("an argument", arguments), ("a result", results)):
-        names = [check_name(leaf.name, f"the name of {what}") for leaf in leaves]
-        if len(set(names)) < len(names):
-            raise InputError(f"two {what.split()[1]}s have one name among {', '.join(names)}; rename one")
+    for what, leaves in (("argument", arguments), ("result", results)):
+        require_once(f"the list of {what}s", [check_name(leaf.name, f"{what} name") for leaf in leaves])
     return Signature(tuple(arguments), tuple(results))
 
 
@@ -94,7 +92,7 @@ def _leaves(name: str, tree: Any) -> list[Leaf]:
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         whole = "_".join(filter(None, (name, jax.tree_util.keystr(path, simple=True, separator="_")))) or "result"
         whole = f"result_{whole}" if whole[:1].isdigit() else whole
-        leaves.append(Leaf(whole, kind_of(jax.dtypes.canonicalize_dtype(leaf.dtype)), tuple(map(int, leaf.shape))))
+        leaves.append(Leaf(whole, kind_of(jax.dtypes.canonicalize_dtype(leaf.dtype)), tuple(leaf.shape)))
     return leaves
 
 

@@ -21,7 +21,6 @@ from string import Template
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike
 
 from dln_jax.export.c.interface import Function, Leaf, Signature, read_interface
 from dln_jax.export.c.text import C_TYPES, NUMPY_TYPES, PRECISIONS, check_name
@@ -60,15 +59,16 @@ def load_c(
     try:
         with tempfile.TemporaryDirectory() as folder:
             # The checked bytes are compiled, even if the folder changes meanwhile.
-            for file_name, content in sources.items():
-                (Path(folder) / file_name).write_bytes(content)
+            files = {f"{folder}/{file_name}": content for file_name, content in sources.items()}
             # No file of an export has a hyphen in its name.
-            between, built = Path(folder) / "for-python.c", Path(folder) / f"lib{name}.so"
-            between.write_text(_binding(name, signatures, PRECISIONS[precision][1], types))
-            texts = [str(Path(folder) / f"{name}.c"), str(between)]
-            compile_c([*STANDARD, *flags, "-fPIC", "-shared", *_UNDEFINED, *texts, "-lm", "-o", str(built)], compiler)
+            files[f"{folder}/for-python.c"] = _binding(name, signatures, PRECISIONS[precision][1], types).encode()
+            for path, content in files.items():
+                Path(path).write_bytes(content)
+            texts = [path for path in files if path.endswith(".c")]
+            built = f"{folder}/lib{name}.so"
+            compile_c([*STANDARD, *flags, "-fPIC", "-shared", *_UNDEFINED, *texts, "-lm", "-o", built], compiler)
             # PyDLL keeps the interpreter's lock: releasing it takes longer than the functions, some microseconds.
-            make = ctypes.PyDLL(str(built))[f"{name}_python"]
+            make = ctypes.PyDLL(built)[f"{name}_python"]
     except OSError as error:
         raise InputError(f"{directory}: not to be built in a temporary folder ({error}); set TMPDIR") from error
     make.argtypes, make.restype = (ctypes.c_int, ctypes.py_object), ctypes.py_object
@@ -96,7 +96,7 @@ def _call_converted(
     made: Mapping[str, Function],
     name: str,
     leaves: Sequence[Leaf],
-    types: Mapping[str, DTypeLike],
+    types: Mapping[str, Any],
     *arguments: Any,
 ) -> Any:
     """Converts arguments to contiguous arrays of the exported types, and passes them to a function in `made`."""
@@ -255,12 +255,13 @@ static PyObject *call_$number(PyObject *self, PyObject *const *arguments, Py_ssi
 """)
 
 
-def _binding(name: str, signatures: Mapping[str, Signature], real: str, types: Mapping[str, DTypeLike]) -> str:
+def _binding(name: str, signatures: Mapping[str, Signature], real: str, types: Mapping[str, Any]) -> str:
     """Returns the source of the binding, which is compiled together with the export."""
     functions = methods = ""
     maximum = 1
     for number, (key, signature) in enumerate(signatures.items()):
-        leaves, count = [*signature.arguments, *signature.written], len(signature.arguments)
+        leaves = [*signature.arguments, *signature.written]
+        count = len(signature.arguments)
         maximum = max(maximum, len(leaves))
         passed = [
             f"memory[{k}]" if leaf.shape or k >= count else f"*(const {C_TYPES[leaf.kind]} *)memory[{k}]"

@@ -33,8 +33,6 @@ from dln_jax.files import write_bytes
 from dln_jax.precision import computing_in, require_precision
 from dln_jax.types import InputError, require_positive
 
-Functions = Mapping[str, tuple[Function, Sequence[Any]]]
-"""Functions of arrays by name, with example arguments."""
 STACK = 256 * 1024
 """Default limit in bytes of the stack that a function may use."""
 LENGTH = 10_000_000
@@ -44,7 +42,7 @@ LINES = 4000
 
 
 def export_c(
-    functions: Functions,
+    functions: Mapping[str, tuple[Function, Sequence[Any]]],
     directory: str | Path,
     *,
     name: str = "model",
@@ -83,7 +81,7 @@ def export_c(
     check_name(name)
     if not functions:
         raise InputError("there is no function to export; give at least one, as {'name': (function, examples)}")
-    chosen: dict[str, tuple[Function, tuple[Any, ...]]] = {}
+    chosen: dict[str, tuple[Function, Any]] = {}
     for key, pair in functions.items():
         if not (isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[1], tuple | list)):
             raise InputError(
@@ -199,7 +197,7 @@ def _write(directory: Path, files: Mapping[str, bytes], *, overwrite: bool) -> l
             raise InputError(f"{directory} is the folder of a run; export to another, such as {directory / 'exported'}")
         if path.name in files and b'"functions"' not in text:
             raise InputError(f"{path} describes no export; choose another folder or name")
-    existing = [directory / name for name in files if (directory / name).exists()]
+    existing = [path for name in files if (path := directory / name).exists()]
     for path in existing:
         if not path.is_file():
             raise InputError(f"{path} is not a file and cannot be replaced; choose another folder or name")
