@@ -27,7 +27,7 @@ from dln_jax.export.c.interface import (
 )
 from dln_jax.export.c.jaxprs import repeated_calls, traced
 from dln_jax.export.c.lowering import program_of
-from dln_jax.export.c.templates import NEEDED, cmake, demo, header, preamble
+from dln_jax.export.c.templates import CMAKE, NEEDED, demo, header, preamble
 from dln_jax.export.c.text import PRECISIONS, check_name, comment, kind_of
 from dln_jax.files import write_bytes
 from dln_jax.precision import computing_in, require_precision
@@ -122,7 +122,7 @@ def export_c(
             f"{name}.h": header(name, written_by, signatures, precision, left_out),
             f"{name}.c": comment(f"{name}.c", written_by, NEEDED) + "".join([preamble(source, name), *parts, *texts]),
             f"{name}_demo.c": demo(name, signatures, precision),
-            "CMakeLists.txt": cmake(name),
+            "CMakeLists.txt": CMAKE.format(name=name),
         }
         if casadi:
             of_casadi = {key: chosen[key] for key in signatures if casadi is True or key in casadi}
@@ -136,7 +136,7 @@ def export_c(
         raise InputError(f"the source would take {longest / 1e6:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")
     encoded = {file_name: text.encode() for file_name, text in files.items()}
     stated = description(name, precision, version, signatures, encoded[f"{name}.h"], encoded[f"{name}.c"])
-    return _write(Path(directory), {**encoded, f"{name}.json": stated}, overwrite=overwrite)
+    return _write(Path(directory), {**encoded, f"{name}.json": stated}, overwrite)
 
 
 def _dtype(leaf: Any) -> np.dtype:
@@ -182,14 +182,14 @@ def _function(
         body = body_of(source, program, results, named, targets)
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
-    unused = [f"    (void){leaf.name};" for leaf in (*signature.arguments, *signature.written)]
-    lines = "\n".join([*unused, *body.lines])
+    unused = [f"    (void){leaf.name};" for leaf in [*signature.arguments, *signature.written]]
+    lines = "\n".join(unused + body.lines)
     text = f"\n{declaration(name, key, signature, 'real')}\n{{\n{lines}\n}}\n"
     total = len(body.lines) + sum(source.parts[part].text.count("\n") for part in body.calls)
     return signature._replace(cost=body.cost), text, total
 
 
-def _write(directory: Path, files: Mapping[str, bytes], *, overwrite: bool) -> list[Path]:
+def _write(directory: Path, files: Mapping[str, bytes], overwrite: bool) -> list[Path]:
     """Writes the files, the description last: an interrupted export differs from its digest, which `load_c` refuses."""
     for path in filter(Path.is_file, directory.glob("*.json")):
         text = path.read_bytes()

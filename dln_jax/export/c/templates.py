@@ -61,6 +61,33 @@ $declared
 
 #endif
 """
+CMAKE = """# Builds the model as a library and its demo: cmake -B build && cmake --build build
+cmake_minimum_required(VERSION 3.10)
+project({name} C)
+
+if(NOT CMAKE_BUILD_TYPE)
+  set(CMAKE_BUILD_TYPE Release)
+endif()
+
+# Functions that vectorise in place of the C library's exp, tanh, sin and others. They pay with the vector instructions
+# of the processor at hand (-DCMAKE_C_FLAGS=-march=native), and are slower than the library's without them.
+option(DLN_OWN_ELEMENTARY "Use the model's own exp, tanh, sin and others" OFF)
+if(DLN_OWN_ELEMENTARY)
+  add_definitions(-DDLN_OWN_ELEMENTARY)
+endif()
+
+add_library({name} {name}.c)
+target_include_directories({name} PUBLIC ${{CMAKE_CURRENT_SOURCE_DIR}})
+set_target_properties({name} PROPERTIES C_STANDARD 99 C_EXTENSIONS OFF POSITION_INDEPENDENT_CODE ON)
+if(UNIX)
+  target_link_libraries({name} PUBLIC m)
+endif()
+
+add_executable({name}_demo {name}_demo.c)
+set_target_properties({name}_demo PROPERTIES C_STANDARD 99 C_EXTENSIONS OFF)
+target_link_libraries({name}_demo PRIVATE {name})
+"""
+"""CMakeLists.txt, which builds the model as a library, and the demo."""
 _DEMO = """#include <stdio.h>
 #include <stdlib.h>
 #include <time.h>
@@ -134,36 +161,6 @@ def demo(name: str, functions: Mapping[str, Signature], precision: str) -> str:
         f"cc -std=c99 -O3 -march=native -DDLN_OWN_ELEMENTARY {name}.c {name}_demo.c -lm -o {name}_demo\n"
         f"./{name}_demo 1000000    also times a million calls of each",
     ) + fill(_DEMO, precision, name=name, blocks=blocks)
-
-
-def cmake(name: str) -> str:
-    """Returns CMakeLists.txt, which builds the model as a library, and the demo."""
-    return f"""# Builds the model as a library and its demo: cmake -B build && cmake --build build
-cmake_minimum_required(VERSION 3.10)
-project({name} C)
-
-if(NOT CMAKE_BUILD_TYPE)
-  set(CMAKE_BUILD_TYPE Release)
-endif()
-
-# Functions that vectorise in place of the C library's exp, tanh, sin and others. They pay with the vector instructions
-# of the processor at hand (-DCMAKE_C_FLAGS=-march=native), and are slower than the library's without them.
-option(DLN_OWN_ELEMENTARY "Use the model's own exp, tanh, sin and others" OFF)
-if(DLN_OWN_ELEMENTARY)
-  add_definitions(-DDLN_OWN_ELEMENTARY)
-endif()
-
-add_library({name} {name}.c)
-target_include_directories({name} PUBLIC ${{CMAKE_CURRENT_SOURCE_DIR}})
-set_target_properties({name} PROPERTIES C_STANDARD 99 C_EXTENSIONS OFF POSITION_INDEPENDENT_CODE ON)
-if(UNIX)
-  target_link_libraries({name} PUBLIC m)
-endif()
-
-add_executable({name}_demo {name}_demo.c)
-set_target_properties({name}_demo PROPERTIES C_STANDARD 99 C_EXTENSIONS OFF)
-target_link_libraries({name}_demo PRIVATE {name})
-"""
 
 
 def preamble(source: Source, name: str) -> str:
