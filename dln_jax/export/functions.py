@@ -92,7 +92,7 @@ def functions_of_run(
     dtype = data_type(description["precision"])
 
     parameters = jax.tree.map(lambda leaf: leaf.astype(dtype), run.parameters)
-    if not all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(parameters)):
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(parameters)):
         raise InputError(f"the model has a parameter which {dtype.__name__} cannot hold; train again, or export in f64")
     run = replace(run, model=model, description=description, parameters=parameters)
     if isinstance(model, FunctionModel):
