@@ -33,8 +33,6 @@ class Arguments:
     """Newton steps of the implicit midpoint rule."""
     temperature: Unstated[float] = None
     """Temperature of the C functions, °C, if friction depends on it (default: the reference of the identification)."""
-    libm: bool = False
-    """Call the C library's exp, expm1, tanh, sin, cos, log and log1p instead of vectorisable ones."""
     casadi: bool = False
     """Add NAME_casadi.c: the functions with exact derivatives for CasADi's external and for acados."""
     finite: bool = False
@@ -45,12 +43,31 @@ class Arguments:
 
 def main(options: Arguments) -> None:
     """Exports the model, and prints the files and the functions left out."""
-    from dln_jax.export.c.run import export_run
+    from dln_jax.export.c.source import export_c
+    from dln_jax.export.functions import functions_of_run
+    from dln_jax.zoo.run import load
 
-    settings = dict(vars(options))
-    paths = export_run(settings.pop("run"), settings.pop("out"), **settings)
+    functions = functions_of_run(
+        load(options.run),
+        precision=options.precision,
+        names=options.functions,
+        iterations=options.iterations,
+        temperature=options.temperature,
+    )
+    casadi: bool | list[str] = options.casadi
+    if casadi and not options.functions:  # NAME_casadi.c has first and second derivatives of its functions
+        casadi = [name for name in functions if not name.endswith(("_jacobian", "_gradient", "_hessian"))]
+    paths = export_c(
+        functions,
+        options.out,
+        name=options.name,
+        casadi=casadi,
+        finite=options.finite,
+        leave_out_large=options.functions is None,
+        overwrite=options.overwrite,
+    )
     print(f"{options.out}: {', '.join(path.name for path in paths)}")
     for path in paths:
-        if path.suffix in (".h", ".c"):
-            left_out = [line for line in path.read_text().splitlines() if line.startswith(" * Left out: ")]
-            print(*(line[3:] for line in left_out), sep="\n", end="\n" * bool(left_out))
+        for line in path.read_text().splitlines():
+            if line.startswith(" * Left out: "):
+                print(line[3:])

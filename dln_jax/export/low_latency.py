@@ -29,8 +29,8 @@ def enable_low_latency() -> None:
         InputError: a backend has already started (any array or list of devices starts it), or JAX is not on the CPU.
     """
     platforms = getattr(jax.config, "jax_platforms")  # noqa: B009  JAX adds its settings as it starts
-    if platforms and platforms.split(",")[0] != "cpu":
-        raise InputError(_only_on_cpu(platforms.split(",")[0]))
+    if (first := (platforms or "cpu").split(",")[0]) != "cpu":
+        raise InputError(_only_on_cpu(first))
     if jax.config.read(_SETTING) and backend_started():
         raise InputError(
             "enable_low_latency() was called after JAX had started its backend, which reads the setting when it "

@@ -11,7 +11,8 @@ from planar_arm import FRICTION, URDF, motions
 from dln_jax import load, load_c, read_robot
 from dln_jax.commands import identify
 from dln_jax.data.log import log_of, split_log
-from dln_jax.export.c.run import export_run
+from dln_jax.export.c.source import export_c
+from dln_jax.export.functions import functions_of_run
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 LOG = "--robot arm.urdf --data log.npz"
@@ -56,7 +57,7 @@ def test_the_model_is_loaded_and_exported_and_the_file_has_what_was_identified(i
     run = load(identified)
     state = np.random.default_rng(1).normal(size=(3, 2))
     assert_allclose(run.parameters.coulomb, FRICTION["coulomb"], atol=0.05)
-    export_run(identified, tmp_path / "c", functions=("inverse_dynamics",))
+    export_c(functions_of_run(run, names=["inverse_dynamics"]), tmp_path / "c")
     in_c = load_c(tmp_path / "c").inverse_dynamics
     assert_allclose(in_c(*state), run.dynamics.inverse_dynamics(*state), rtol=1e-12)
     robot = read_robot(identified / "arm_identified.urdf")

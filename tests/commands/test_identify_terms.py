@@ -10,7 +10,8 @@ from small_logs import small_log
 
 from dln_jax import dynamics, load, load_c, read_robot
 from dln_jax.commands import identify
-from dln_jax.export.c.run import export_run
+from dln_jax.export.c.source import export_c
+from dln_jax.export.functions import functions_of_run
 from dln_jax.models.trees import make_rigid_tree
 
 pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
@@ -59,7 +60,7 @@ def test_all_terms_are_identified_and_written(place, capsys):
         assert_allclose(run.description["cooling"], TERMS["cooling"], atol=3e-3)
         assert_allclose(run.parameters.coulomb, [0.4, 0.3], atol=0.05)
         # Hot grease: the same functions in C at a stated temperature.
-        export_run("run", "c", functions=("inverse_dynamics",), temperature=60.0)
+        export_c(functions_of_run(run, names=["inverse_dynamics"], temperature=60.0), "c")
         hot = dynamics(run.model.energies(run.parameters, 60.0)).inverse_dynamics(*state)
         assert_allclose(load_c("c").inverse_dynamics(*state), hot, rtol=1e-10)
         assert np.abs(hot - run.dynamics.inverse_dynamics(*state)).max() > 0.05

@@ -10,8 +10,8 @@ from calls import one_line
 from numpy.testing import assert_allclose
 
 from dln_jax import Needs, build, describe, load_c
-from dln_jax.export.c.families import functions_of_run
-from dln_jax.export.c.run import export_run
+from dln_jax.export.c.source import export_c
+from dln_jax.export.functions import functions_of_run
 from dln_jax.models.uncertainty import Domain, Uncertainty, out_of_distribution, predictive
 from dln_jax.zoo.parameter_files import save_uncertainty
 from dln_jax.zoo.run import load, save
@@ -82,7 +82,7 @@ def test_what_is_damaged_or_does_not_fit_is_refused(folder, tmp_path_factory):
 def test_c_is_equal(folder, tmp_path):
     for precision, dtype, tolerance, undetermined in (("f64", float, 1e-11, 0), ("f32", np.float32, 1e-4, 3)):
         run, out = load_with(folder, known(undetermined)), tmp_path / precision
-        export_run(folder, out, functions=["torque_std", "out_of_distribution"], precision=precision)
+        export_c(functions_of_run(run, names=["torque_std", "out_of_distribution"], precision=precision), out)
         in_c, flags = load_c(out), set()
         for state in STATES:
             rounded = state.astype(dtype)

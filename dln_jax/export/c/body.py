@@ -40,7 +40,6 @@ class Source:
     """Tables and helper functions shared by the functions of one source file."""
 
     precision: str
-    libm: bool
     finite: bool = False
     """Whether arguments and intermediate results are finite."""
     loop_bound: int | None = None

@@ -19,38 +19,77 @@ the stack sevenfold.
 """
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import accumulate, pairwise, takewhile
-from typing import Any, NamedTuple
+from math import prod
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.flatten_util import ravel_pytree
 
-from dln_jax.export.c.body import Body, Source
+from dln_jax.export.c.body import Source
 from dln_jax.export.c.emit import body_of
-from dln_jax.export.c.interface import Leaf, argument_leaves, result_leaves
+from dln_jax.export.c.interface import Function, Leaf, signature_of
 from dln_jax.export.c.lowering import program_of, traced
-from dln_jax.export.c.templates import CASADI_DECLARATIONS, CASADI_FUNCTION, stated
+from dln_jax.export.c.templates import stated
 from dln_jax.types import InputError
 
-Function = Callable[[Array], Array]
+Flat = Callable[[Array], Array]
+"""x -> y, vectors."""
+Way = Callable[[Array, Array], list[Array]]
+"""(x, seeds) -> the dense results of a symbol."""
+_DECLARATIONS = """
+typedef double casadi_real;
+typedef long long int casadi_int;
 
+#ifdef __cplusplus
+#define EXPORTED extern "C"
+#else
+#define EXPORTED
+#endif
+/* CasADi's queries about a function. The function has no state that needs reference counts, and its workspace is on
+   the stack. */
+#define DESCRIBED(f, inputs, outputs) \\
+    EXPORTED void f##_incref(void) {} \\
+    EXPORTED void f##_decref(void) {} \\
+    EXPORTED casadi_int f##_n_in(void) { return inputs; } \\
+    EXPORTED casadi_int f##_n_out(void) { return outputs; } \\
+    EXPORTED const char *f##_name_in(casadi_int i) { return f##_names[i]; } \\
+    EXPORTED const char *f##_name_out(casadi_int i) { return f##_names[inputs + i]; } \\
+    EXPORTED const casadi_int *f##_sparsity_in(casadi_int i) { return f##_sparsities[i]; } \\
+    EXPORTED const casadi_int *f##_sparsity_out(casadi_int i) { return f##_sparsities[inputs + i]; } \\
+    EXPORTED int f(const casadi_real **arg, casadi_real **res, casadi_int *integers, casadi_real *reals, int memory)
+"""
+_FUNCTION = """
+/* {cost} */
+static const char *const {symbol}_names[] = {{{names}}};
+static const casadi_int {symbol}_sparsities[][{length}] = {{{sparsities}}};
+DESCRIBED({symbol}, {inputs}, {outputs})
+{{
+{lines}
+}}
+"""
+ABOUT = """{name}_casadi.c: functions of {name}.h with exact derivatives, for CasADi 3.6 and later.
+{written_by}
 
-class Block(NamedTuple):
-    """An input or output: a dense matrix, or one declared without elements."""
+cmake -B build && cmake --build build, then in Python, with the name of one of the functions for F:
+F = casadi.external("casadi_{name}_F", "build/lib{name}.so")
 
-    name: str
-    rows: int
-    columns: int
-    dense: bool = True
-
-    @property
-    def size(self) -> int:
-        """Number of elements."""
-        return self.rows * self.columns if self.dense else 0
+acados loads the same library; its folder is model_external_shared_lib_dir, and its name, {name},
+model_external_shared_lib_name among the solver's options."""
+BUILD = """
+# The library that CasADi and acados load
+add_library({name}_casadi SHARED {name}.c {name}_casadi.c)
+set_target_properties({name}_casadi PROPERTIES OUTPUT_NAME {name} ARCHIVE_OUTPUT_NAME {name}_casadi
+  C_STANDARD 99 C_EXTENSIONS OFF WINDOWS_EXPORT_ALL_SYMBOLS ON)
+if(UNIX)
+  target_link_libraries({name}_casadi PRIVATE m)
+endif()
+"""
 
 
 def external_functions(
@@ -71,175 +110,171 @@ def external_functions(
     text, largest, left_out = "", 1, []
     for key, (function, examples) in functions.items():
         symbol = f"casadi_{name}_{key}"
+        prefix = written = ""
+        kept = source
         try:
-            inputs, outputs, flat = _flat(symbol, function, examples)
-            written, kept = "", source
-            for prefix, blocks, results, ways in _derivatives(inputs, outputs, flat):
-                kept, more = _function(kept, prefix + symbol, blocks, results, ways, stack)
+            examples = jax.eval_shape(lambda *leaves: leaves, *examples)
+            signature = signature_of(function, examples, jax.eval_shape(function, *examples))
+            inputs, outputs = ([_matrix(leaf) for leaf in leaves] for leaves in signature[:2])
+            if not inputs:
+                raise InputError("there are no arguments to differentiate with respect to; export it without casadi")
+            names = [start + leaf.name for start in ("", "out_", "adj_", "fwd_") for leaf in [*inputs, *outputs]]
+            for word in (symbol, *names):
+                if re.search("__|_$", word) or word in ("null", "jac", "hess") or names.count(word) > 1:
+                    raise InputError(f"CasADi has no such name as {word}, or derivatives have it too; choose another")
+            symbols = _derivatives(inputs, outputs, _flat(function, examples))
+            for prefix, (before, after, ways) in symbols.items():
+                kept, more = _function(kept, prefix + symbol, before, after, ways, stack)
                 written += more
-                largest = max(largest, *(block.size for block in blocks))
+                largest = max(largest, *(prod(leaf.shape) for leaf in before if leaf.kind))
         except InputError as error:
+            reason = f"{prefix}{symbol}: {error}"
             if not leave_out:
-                raise
-            left_out.append(str(error))
+                raise InputError(reason) from error
+            left_out.append(f"Left out: {reason}")
             continue
         source, text = kept, text + written
-    return source, f"{CASADI_DECLARATIONS}\nstatic const casadi_real zeros[{largest}] = {{0}};\n{text}", left_out
+    return source, f"{_DECLARATIONS}\nstatic const casadi_real zeros[{largest}] = {{0}};\n{text}", left_out
 
 
-def _flat(
-    symbol: str, function: Callable[..., Any], examples: Sequence[Any]
-) -> tuple[list[Block], list[Block], Function]:
-    """Returns inputs, outputs, and the function from all inputs to all outputs as column-major vectors."""
-    leaves, tree = jax.tree.flatten(tuple(examples))
-    shapes = [np.shape(leaf) for leaf in leaves]
-    try:
-        arguments = argument_leaves(function, examples)
-        inputs = [_block(leaf) for leaf in arguments]
-        if not inputs:
-            raise InputError("there are no arguments to differentiate with respect to; export it without casadi")
-        outputs = [_block(leaf) for leaf in result_leaves(jax.eval_shape(function, *examples), arguments)]
-        names = [prefix + block.name for prefix in ("", "out_", "adj_", "fwd_") for block in [*inputs, *outputs]]
-        for name in (symbol, *names):
-            if re.search("__|_$", name) or name in ("null", "jac", "hess") or names.count(name) > 1:
-                raise InputError(f"CasADi has no such name as {name}, or derivatives have it too; choose another")
-    except InputError as error:
-        raise InputError(f"{symbol}: {error}") from error
-    cuts = np.cumsum([block.size for block in inputs])[:-1]
-
-    def flat(x: Array) -> Array:
-        # Column-major order of a matrix is row-major order of its transpose.
-        arguments = [part.reshape(shape[::-1]).T for part, shape in zip(jnp.split(x, cuts), shapes, strict=True)]
-        results = jax.tree.leaves(function(*jax.tree.unflatten(tree, arguments)))
-        return jnp.concatenate([jnp.ravel(jnp.asarray(result).T).astype(x.dtype) for result in results])
-
-    return inputs, outputs, flat
-
-
-def _block(leaf: Leaf) -> Block:
+def _matrix(leaf: Leaf) -> Leaf:
     if leaf.kind != "real" or len(leaf.shape) > 2 or 0 in leaf.shape:
         raise InputError(
             f"{leaf.name} is {leaf.kind} of shape {list(leaf.shape)}; CasADi takes real numbers of at most two axes, "
             "none of them empty, so export it without casadi"
         )
-    rows, columns = (*leaf.shape, 1, 1)[:2]
-    return Block(leaf.name, rows, columns)
+    return leaf._replace(shape=(*leaf.shape, 1, 1)[:2])
 
 
-def _forward(function: Function, x: Array) -> Array:
+def _flat(function: Function, examples: Sequence[Any]) -> Flat:
+    """Returns the function from all inputs to all outputs, as column-major vectors end to end."""
+    leaves, tree = jax.tree.flatten(examples)
+    # Column-major order of a matrix is row-major order of its transpose.
+    _, parts_of = ravel_pytree([np.zeros(leaf.shape[::-1]) for leaf in leaves])
+
+    def flat(x):
+        results = jax.tree.leaves(function(*jax.tree.unflatten(tree, [part.T for part in parts_of(x)])))
+        return jnp.concatenate([jnp.ravel(jnp.asarray(result).T).astype(x.dtype) for result in results])
+
+    return flat
+
+
+def _forward(function: Flat, x: Array) -> Array:
     """Returns the transposed Jacobian [n, m] of a function from x [n] to y [m], one input at a time."""
-    return lax.map(lambda k: _push(function, x, _unit(k, x)), jnp.arange(x.size))
+
+    def along(k):
+        # A comparison, because rows of an identity matrix would be stored in an array.
+        return jax.jvp(function, (x,), ((jnp.arange(x.size) == k).astype(x.dtype),))[1]
+
+    return lax.map(along, jnp.arange(x.size))
 
 
-def _reverse(function: Function, x: Array) -> Array:
+def _reverse(function: Flat, x: Array) -> Array:
     """Returns the transposed Jacobian [n, m], one output at a time."""
     value, pulled = jax.vjp(function, x)
-    return lax.map(lambda k: pulled(_unit(k, value))[0], jnp.arange(value.size)).T
+    return _forward(lambda seeds: pulled(seeds)[0], jnp.zeros_like(value)).T
 
 
-def _unit(k: Array, like: Array) -> Array:
-    # A comparison, because rows of an identity matrix would be stored in an array.
-    return (jnp.arange(like.size) == k).astype(like.dtype)
-
-
-def _push(function: Function, x: Array, seeds: Array) -> Array:
-    """Returns (dy/dx) seeds [m]."""
-    return jax.jvp(function, (x,), (seeds,))[1]
-
-
-def _pull(function: Function, x: Array, seeds: Array) -> Array:
-    """Returns (dy/dx)ᵀ seeds [n] in reverse mode."""
-    return jax.vjp(function, x)[1](seeds)[0]
-
-
-def _pull_forward(function: Function, x: Array, seeds: Array) -> Array:
-    """Returns (dy/dx)ᵀ seeds [n] in forward mode, which also differentiates loops of unknown length."""
-    return _forward(function, x) @ seeds
-
-
-def _derivatives(inputs: list[Block], outputs: list[Block], flat: Any) -> Iterable[tuple[str, Any, Any, Any]]:
-    """Yields prefix, inputs and outputs of every derivative, and functions that compute it, cheapest first."""
+def _derivatives(
+    inputs: list[Leaf], outputs: list[Leaf], flat: Flat
+) -> dict[str, tuple[list[Leaf], list[Leaf], list[Way]]]:
+    """Returns prefix -> inputs, outputs, and functions that compute them, the cheapest first."""
     x_parts, y_parts = (
-        [slice(*ends) for ends in pairwise([0, *accumulate(block.size for block in blocks)])]
-        for blocks in (inputs, outputs)
+        [slice(*ends) for ends in pairwise(accumulate((prod(leaf.shape) for leaf in leaves), initial=0))]
+        for leaves in (inputs, outputs)
     )
 
+    def split(vector, parts):
+        return [vector[part] for part in parts]
+
     # Rows of the transposed Jacobian are columns of the Jacobian, which CasADi stores one after the other.
-    def slopes(way: Any, x: Array, _: Any) -> Array:
-        transposed = way(flat, x)
-        return jnp.concatenate([transposed[i, j].ravel() for j in y_parts for i in x_parts])
+    def slopes(transposed, x, _):
+        by_x = transposed(flat, x)
+        return [by_x[i, j] for j in y_parts for i in x_parts]
 
-    def curvature(pull: Any, x: Array, seeds: Array) -> Array:
-        both = _forward(lambda x: jnp.concatenate([pull(flat, x, seeds), flat(x)]), x)
-        hessian, transposed = both[:, : x.size], both[:, x.size :]
-        blocks = [[*(hessian[k, i] for k in x_parts), *(transposed[i, j].T for j in y_parts)] for i in x_parts]
-        return jnp.concatenate([block.ravel() for row in blocks for block in row])
+    def push(x, seeds):
+        return split(jax.jvp(flat, (x,), (seeds,))[1], y_parts)
 
-    def of(prefix: str, blocks: list[Block]) -> list[Block]:
-        return [block._replace(name=f"{prefix}_{block.name}", dense=prefix != "out") for block in blocks]
+    def pull(x, seeds):
+        return jax.vjp(flat, x)[1](seeds)[0]
 
-    def jacobians(results: list[Block], variables: list[Block]) -> list[Block]:
+    def pull_forward(x, seeds):  # also for loops of unknown length
+        return _forward(flat, x) @ seeds
+
+    def adjoint(pull, x, seeds):
+        return split(pull(x, seeds), x_parts)
+
+    def curvature(pull, x, seeds):
+        by_x = _forward(lambda x: jnp.concatenate([pull(x, seeds), flat(x)]), x)
+        hessian, by_seeds = by_x[:, : x.size], by_x[:, x.size :]
+        rows = ([*(hessian[k, i] for k in x_parts), *(by_seeds[i, j].T for j in y_parts)] for i in x_parts)
+        return [block for row in rows for block in row]
+
+    def renamed(prefix, leaves):
+        # CasADi declares copies of outputs, and derivatives with respect to them, without elements: of no kind.
+        kind = "" if prefix == "out" else "real"
+        return [leaf._replace(name=f"{prefix}_{leaf.name}", kind=kind) for leaf in leaves]
+
+    def jacobians(results, variables):
         return [
-            Block(f"jac_{result.name}_{variable.name}", result.size, variable.rows * variable.columns, variable.dense)
+            Leaf(f"jac_{result.name}_{variable.name}", variable.kind, (prod(result.shape), prod(variable.shape)))
             for result in results
             for variable in variables
         ]
 
-    both, adjoints = [*inputs, *of("out", outputs)], of("adj", inputs)
-    seeded, pulls = [*both, *of("adj", outputs)], (_pull, _pull_forward)
-    more_inputs = sum(block.size for block in inputs) > sum(block.size for block in outputs)
-    directions = (_forward, _reverse)[:: -1 if more_inputs else 1]
-    yield "", inputs, outputs, [lambda x, _: flat(x)]
-    yield "jac_", both, jacobians(outputs, inputs), [partial(slopes, way) for way in directions]
-    yield "fwd1_", [*both, *of("fwd", inputs)], of("fwd", outputs), [partial(_push, flat)]
-    yield "adj1_", seeded, adjoints, [partial(pull, flat) for pull in pulls]
-    with_adjoints = [*seeded, *of("out", adjoints)]
-    yield "jac_adj1_", with_adjoints, jacobians(adjoints, seeded), [partial(curvature, pull) for pull in pulls]
+    both, adjoints = [*inputs, *renamed("out", outputs)], renamed("adj", inputs)
+    seeded = [*both, *renamed("adj", outputs)]
+    directions = [_forward, _reverse]
+    if x_parts[-1].stop > y_parts[-1].stop:
+        directions.reverse()
+    pulls = (pull, pull_forward)
+    return {
+        "": (inputs, outputs, [lambda x, _: split(flat(x), y_parts)]),
+        "jac_": (both, jacobians(outputs, inputs), [partial(slopes, way) for way in directions]),
+        "fwd1_": ([*both, *renamed("fwd", inputs)], renamed("fwd", outputs), [push]),
+        "adj1_": (seeded, adjoints, [partial(adjoint, way) for way in pulls]),
+        "jac_adj1_": (
+            [*seeded, *renamed("out", adjoints)],
+            jacobians(adjoints, seeded),
+            [partial(curvature, way) for way in pulls],
+        ),
+    }
 
 
 def _function(
-    source: Source, symbol: str, inputs: list[Block], outputs: list[Block], ways: Sequence[Any], stack: int
+    source: Source, symbol: str, inputs: list[Leaf], outputs: list[Leaf], ways: Sequence[Way], stack: int
 ) -> tuple[Source, str]:
     """Returns the source and the C text from the first method that can be compiled."""
-    failure: Exception | None = None
+    dense = [k for k, leaf in enumerate(inputs) if leaf.kind]
+    n = sum(prod(leaf.shape) for leaf in takewhile(lambda leaf: leaf.kind, inputs))
+    names = {place: (f"in_{k}", False) for place, k in enumerate(dense)}
+    targets = [f"res[{j}]" for j, leaf in enumerate(outputs) if leaf.kind]
+    reason = ""
+
+    def evaluate(way, *columns):
+        return way(*jnp.split(jnp.concatenate(columns), [n]))
+
     for way in ways:
         try:
-            body = _body(source.copy(), inputs, outputs, way)
+            closed, _ = traced(partial(evaluate, way), [np.zeros(prod(inputs[k].shape)) for k in dense])
+            program, _, results = program_of(closed, finite=source.finite)
+            body = body_of(source.copy(), program, results, names, targets, optional=True)
         except (TypeError, ValueError, NotImplementedError) as error:  # JAX cannot differentiate it, or it has no C
-            failure = error
+            reason = str(error).strip().partition("\n")[0]
             continue
-        if body.stack <= stack:
-            blocks = [*inputs, *outputs]
-            return body.source, CASADI_FUNCTION.format(
-                symbol=symbol,
-                names=", ".join(f'"{block.name}"' for block in blocks),
-                length=3 + max(0 if block.dense else block.columns for block in blocks),
-                sparsities=", ".join(f"{{{block.rows}, {block.columns}, {int(block.dense)}}}" for block in blocks),
-                cost=stated(body.cost), inputs=len(inputs), outputs=len(outputs),
-                lines="\n".join(body.lines),
-            )  # fmt: skip
-        kib = body.stack / 1024
-        failure = InputError(f"it would take {kib:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB")
-    reason = str(failure).strip().partition("\n")[0]
-    raise InputError(f"{symbol}: {reason}; export it without casadi") from failure
-
-
-def _body(source: Source, inputs: list[Block], outputs: list[Block], way: Callable[..., Array]) -> Body:
-    cuts = np.cumsum([output.size for output in outputs if output.dense])[:-1]
-    dense = [k for k, block in enumerate(inputs) if block.dense]
-    n = sum(block.size for block in takewhile(lambda block: block.dense, inputs))
-
-    def evaluate(*columns: Array) -> list[Array]:
-        x, seeds = jnp.split(jnp.concatenate(columns), [n])
-        return jnp.split(way(x, seeds), cuts)
-
-    closed, _ = traced(evaluate, [np.zeros(inputs[k].size) for k in dense])
-    program, arguments, results = program_of(closed, finite=source.finite)
-    names = {place: (f"in_{k}", False) for place, k in enumerate(dense)}
-    targets = [f"res[{j}]" for j, output in enumerate(outputs) if output.dense]
-    body = body_of(source, program, results, names, targets, optional=True)
-    used = [k for k, node in zip(dense, arguments, strict=True) if node in body.plan.nodes]
-    lines = [f"const casadi_real *in_{k} = arg[{k}] ? arg[{k}] : zeros;" for k in used]
-    lines.append("(void)arg; (void)integers; (void)reals; (void)memory;")
-    body.lines = [*(f"    {line}" for line in lines), *body.lines, "    return 0;"]
-    return body
+        if body.stack > stack:
+            kib = body.stack / 1024
+            reason = f"it would take {kib:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB"
+            continue
+        lines = [f"    const casadi_real *in_{k} = arg[{k}] ? arg[{k}] : zeros; (void)in_{k};" for k in dense]
+        lines += ["    (void)res; (void)integers; (void)reals; (void)memory;", *body.lines, "    return 0;"]
+        leaves = [*inputs, *outputs]
+        return body.source, _FUNCTION.format(
+            symbol=symbol,
+            names=", ".join(f'"{leaf.name}"' for leaf in leaves),
+            length=3 + max(0 if leaf.kind else leaf.shape[1] for leaf in leaves),
+            sparsities=", ".join(f"{{{leaf.shape[0]}, {leaf.shape[1]}, {int(leaf.kind != '')}}}" for leaf in leaves),
+            cost=stated(body.cost), inputs=len(inputs), outputs=len(outputs),
+            lines="\n".join(lines),
+        )  # fmt: skip
+    raise InputError(f"{reason}; export it without casadi")

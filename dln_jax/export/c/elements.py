@@ -24,7 +24,7 @@ _BOXES = 6
 
 def unrolled(body: Body, node: Node) -> None:
     """Writes a scalar as an expression of variables and of the scalars fused into it, or a sine with its cosine."""
-    if node in body.plan.beside and not body.source.libm:
+    if node in body.plan.beside:
         pair = sorted((node, body.plan.beside[node]), key=lambda scalar: scalar.op, reverse=True)
         body.spend(sin=1)
         for scalar in pair:
@@ -57,7 +57,7 @@ def _expression(body: Body, node: Node, args: list[str], *, looped: bool = False
     operation = OPERATIONS[node.op]
     if node.dtype == "real" or node.args[0].dtype == "real":
         body.spend(**{node.op: 1})
-    if operation.function in VECTORISED and not body.source.libm:
+    if operation.function in VECTORISED:
         return f"elementary_{node.op}({args[0]})"
     if looped and node.dtype == "real" and node.op in _CHOICES:
         return _CHOICES[node.op].format(*args)
@@ -79,7 +79,7 @@ def looped(body: Body, node: Node) -> None:
                 moved = arg.op == "gather" and arg not in body.plan.arrays
                 where[arg] = read_source(arg, positions) if moved else (arg, positions)
     target = body.kept(node)
-    if node.op in VECTORISED and not body.source.libm:
+    if node.op in VECTORISED:
         body.spend(**{node.op: node.size})
         body.line(f"elementary_{node.op}_each({node.size}, {body.name(node.args[0])}, {target});")
         return

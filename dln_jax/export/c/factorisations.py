@@ -1,6 +1,7 @@
 """C of factorisations of small dense matrices, and of triangular solves."""
 
 from collections.abc import Collection
+from string import Template
 from textwrap import dedent
 
 from dln_jax.export.c.body import Body
@@ -12,7 +13,7 @@ _SWEEPS = 16
 FUNCTIONS = {
     "cholesky": """
     /* Lower triangular l with l l^T = a [n, n]; all NaN where a is not positive definite */
-    static void cholesky(int n, const real *a, real *l)
+    static void elementary_cholesky(int n, const real *a, real *l)
     {
         int definite = 1; /* a NaN reaches all elements that depend on it */
         for (int i = 0; i < n; ++i)
@@ -23,7 +24,7 @@ FUNCTIONS = {
                     continue;
                 }
                 for (int k = 0; k < j; ++k) rest -= l[i * n + k] * l[j * n + k];
-                l[i * n + j] = i == j ? SQRT(rest) : rest / l[j * n + j];
+                l[i * n + j] = i == j ? sqrt${f}(rest) : rest / l[j * n + j];
                 definite &= i != j || !(rest <= 0);
             }
         for (int i = 0; !definite && i < n * n; ++i) l[i] = (real)NAN;
@@ -31,7 +32,8 @@ FUNCTIONS = {
     """,
     "triangular_solve": """
     /* x [n, columns] with a x = b, a lower or upper triangular */
-    static void triangular_solve(int n, int columns, int lower, int unit, const real *a, const real *b, real *x)
+    static void elementary_triangular_solve(
+        int n, int columns, int lower, int unit, const real *a, const real *b, real *x)
     {
         for (int turn = 0; turn < n; ++turn) {
             const int i = lower ? turn : n - 1 - turn;
@@ -45,14 +47,14 @@ FUNCTIONS = {
     """,
     "lu": """
     /* Factors of rows of a [n, m] by elimination with partial pivoting: packed, row exchanged at each step, order */
-    static void lu(int n, int m, const real *a, real *packed, int *pivots, int *order)
+    static void elementary_lu(int n, int m, const real *a, real *packed, int *pivots, int *order)
     {
         for (int i = 0; i < n * m; ++i) packed[i] = a[i];
         for (int i = 0; i < n; ++i) order[i] = i;
         for (int k = 0; k < n && k < m; ++k) {
             int pivot = k;
             for (int i = k + 1; i < n; ++i)
-                if (FABS(packed[i * m + k]) > FABS(packed[pivot * m + k])) pivot = i;
+                if (fabs${f}(packed[i * m + k]) > fabs${f}(packed[pivot * m + k])) pivot = i;
             pivots[k] = pivot;
             if (pivot != k) {
                 const int moved = order[k];
@@ -91,7 +93,7 @@ FUNCTIONS = {
         for (int k = 0; k < m && k < n; ++k) {
             real *tau = packed + m * n + k, *corner = packed + k * n + k, largest = 0, below = 0;
             for (int i = k + 1; i < m; ++i) {
-                const real size = FABS(packed[i * n + k]);
+                const real size = fabs${f}(packed[i * n + k]);
                 largest = size > largest ? size : largest;
             }
             for (int i = k + 1; i < m; ++i) { /* scaled, so that no square overflows; a NaN stays one */
@@ -100,8 +102,8 @@ FUNCTIONS = {
             }
             *tau = 0;
             if (below == 0) continue;
-            const real rest = largest * SQRT(below), scale = FABS(*corner) > rest ? FABS(*corner) : rest;
-            const real length = scale * SQRT((*corner / scale) * (*corner / scale) + (rest / scale) * (rest / scale));
+            const real rest = largest * sqrt${f}(below), scale = fabs${f}(*corner) > rest ? fabs${f}(*corner) : rest;
+            const real u = *corner / scale, v = rest / scale, length = scale * sqrt${f}(u * u + v * v);
             const real diagonal = *corner < 0 ? length : -length, first = *corner - diagonal;
             *tau = -first / diagonal;
             for (int i = k + 1; i < m; ++i) packed[i * n + k] /= first;
@@ -146,10 +148,10 @@ FUNCTIONS = {
             for (int p = 0; p < n; ++p)
                 for (int q = p + 1; q < n; ++q) {
                     const real x = left[p * n + p], y = left[q * n + q], z = left[p * n + q];
-                    if (FABS(x) + FABS(z) == FABS(x) && FABS(y) + FABS(z) == FABS(y)) continue;
-                    const real theta = (y / 2 - x / 2) / z, size = FABS(theta);
-                    const real tangent = (theta < 0 ? -(real)1 : 1) / (size + SQRT(1 + size * size));
-                    const real c = 1 / SQRT(1 + tangent * tangent), s = tangent * c;
+                    if (fabs${f}(x) + fabs${f}(z) == fabs${f}(x) && fabs${f}(y) + fabs${f}(z) == fabs${f}(y)) continue;
+                    const real theta = (y / 2 - x / 2) / z, size = fabs${f}(theta);
+                    const real tangent = (theta < 0 ? -(real)1 : 1) / (size + sqrt${f}(1 + size * size));
+                    const real c = 1 / sqrt${f}(1 + tangent * tangent), s = tangent * c;
                     rotated = 1;
                     for (int i = 0; i < n; ++i) {
                         const real u = vectors[i * n + p], v = vectors[i * n + q];
@@ -188,60 +190,55 @@ FUNCTIONS = {
 def definitions(names: Collection[str], suffix: str) -> str:
     """Returns the C text of the named functions."""
     text = "".join("\n" + dedent(FUNCTIONS[name]).strip() + "\n" for name in FUNCTIONS if name in names)
-    text = text.replace("$sweeps", str(_SWEEPS))
-    return text.replace("SQRT(", f"sqrt{suffix}(").replace("FABS(", f"fabs{suffix}(")
+    return Template(text).substitute(f=suffix, sweeps=_SWEEPS)
 
 
-def _eliminations(rows: int, columns: int) -> dict[str, int]:
-    steps = range(min(rows, columns))
-    return {
-        "div": sum(rows - k - 1 for k in steps),
-        "multiply_add": sum((rows - k - 1) * (columns - k - 1) for k in steps),
-    }
-
-
-def _reflections(m: int, n: int) -> dict[str, int]:
-    every = 2 * m * n * min(m, n)
-    return {"div": min(m, n) * (2 * m + 5), "multiply_add": every, "mul": every, "sqrt": 2 * min(m, n)}
-
-
-_SIZES = {
-    "cholesky": lambda a, _: (
-        a[0], {"multiply_add": (a[0] ** 3 - a[0]) // 6, "div": a[0] * (a[0] - 1) // 2, "sqrt": a[0]}
-    ),
-    "triangular_solve": lambda a, b, _: (
-        *b, {"multiply_add": a[0] * (a[0] - 1) // 2 * b[1], "div": a[0] * b[1]}
-    ),
-    "lu": lambda a, _: (*a, _eliminations(*a)),
-    "permutation": lambda pivots, order: (*order, *pivots, {}),
-    "geqrf": lambda a, _: (*a, _reflections(*a)),
-    "householder_product": lambda a, tau, _: (
-        *a, *tau, {"multiply_add": 2 * a[0] * a[1] * tau[0], "mul": a[0] * a[1] * tau[0]}
-    ),
-    "eigh": lambda a, _: (a[0], {
-        name: _SWEEPS * a[0] * (a[0] - 1) // 2 * count
-        for name, count in {"mul": 8 * a[0] + 4, "add": 4 * a[0] + 9, "div": 5, "sqrt": 2}.items()
-    }),
+_COSTS = {
+    "cholesky": lambda n: {"multiply_add": (n**3 - n) // 6, "div": n * (n - 1) // 2, "sqrt": n},
+    "triangular_solve": lambda n, columns: {"multiply_add": n * (n - 1) // 2 * columns, "div": n * columns},
+    "lu": lambda n, m: {
+        "multiply_add": sum((n - k) * (m - k) for k in range(1, min(n, m) + 1)),
+        "div": sum(n - k for k in range(1, min(n, m) + 1)),
+    },
+    "permutation": lambda n, exchanges: {},
+    "geqrf": lambda m, n: {
+        "multiply_add": 2 * m * n * min(m, n), "mul": 2 * m * n * min(m, n), "div": min(m, n) * (2 * m + 5),
+        "sqrt": 2 * min(m, n),
+    },
+    "householder_product": lambda m, n, k: {"multiply_add": 2 * m * n * k, "mul": m * n * k},
+    "eigh": lambda n: {
+        name: _SWEEPS * n * (n - 1) // 2 * count
+        for name, count in {"mul": 8 * n + 4, "add": 4 * n + 9, "div": 5, "sqrt": 2}.items()
+    },
 }  # fmt: skip
-"""Sizes passed to a C function, and an upper bound on its operations, by the shapes of arguments and result."""
+"""Upper bound on the operations of a C function, by the sizes that it takes."""
 
 
 def _call(body: Body, node: Node) -> None:
     """Calls a node's C function with sizes, pointers to the arguments, and arrays for the results."""
-    *sizes, operations = _SIZES[node.op](*(arg.shape for arg in node.args), node.shape)
-    a, arrays = node.args[0], []
-    if node.op == "lu":  # results of two types, which `project` nodes read
-        arrays = [("real", a.size), ("int", min(a.shape)), ("int", a.shape[0])]
-    elif node.op == "eigh":  # a workspace
-        arrays = [("real", a.size)]
+    a = node.args[0]
+    sizes, arrays = a.shape, []
+    match node.op:
+        case "triangular_solve":
+            sizes = node.args[1].shape
+        case "permutation":
+            sizes = *node.shape, *a.shape
+        case "householder_product":
+            sizes = *a.shape, *node.args[1].shape
+        case "lu":  # results of two types, which `project` nodes read
+            arrays = [("real", a.size), ("int", min(a.shape)), ("int", a.shape[0])]
+        case "cholesky":
+            sizes = a.shape[:1]
+        case "eigh":
+            sizes, arrays = a.shape[:1], [("real", a.size)]  # a workspace
     targets = [f"v{node.number}_{place}" for place in range(len(arrays))]
     for target, (kind, size) in zip(targets, arrays, strict=True):
         body.declared(target, kind, size)
-    targets += [body.kept(node)] if node.op != "lu" else []
-    prefix = "" if node.op in ("cholesky", "triangular_solve", "lu") else "elementary_"
+    if node.op != "lu":
+        targets.append(body.kept(node))
     values = [*sizes, *map(int, node.attribute or ()), *map(body.pointer, node.args), *targets]
-    body.line(f"{prefix}{node.op}({', '.join(map(str, values))});")
-    body.spend(**operations)
+    body.line(f"elementary_{node.op}({', '.join(map(str, values))});")
+    body.spend(**_COSTS[node.op](*sizes))
 
 
 WRITERS = dict.fromkeys(FUNCTIONS, _call)

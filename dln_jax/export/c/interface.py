@@ -9,16 +9,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 
-from dln_jax.export.c.text import C_TYPES, LARGEST, PRECISIONS, check_name, kind_of
+from dln_jax.export.c.text import C_TYPES, check_name, kind_of
 from dln_jax.files import read_json
-from dln_jax.types import InputError
+from dln_jax.types import InputError, require_once
 
-FORMAT = 5
+FORMAT = 6
 """Version of the names and signatures in exported sources and of the JSON description."""
-AGAIN = "export it again"
-KINDS = {kind: c for kind, c in C_TYPES.items() if kind != "index"}
+Function = Callable[..., Any]
 
 
 class Leaf(NamedTuple):
@@ -27,6 +25,11 @@ class Leaf(NamedTuple):
     name: str
     kind: str
     shape: tuple[int, ...]
+
+    @property
+    def described(self) -> str:
+        """Name and shape, for messages and comments."""
+        return f"{self.name} {list(self.shape)}" if self.shape else self.name
 
 
 class Cost(NamedTuple):
@@ -57,56 +60,45 @@ class Signature(NamedTuple):
     @property
     def returns(self) -> bool:
         """Whether the function returns its only result, a scalar, instead of writing to an array."""
-        return len(self.results) == 1 and self.results[0].shape == ()
+        return [leaf.shape for leaf in self.results] == [()]
+
+    @property
+    def written(self) -> tuple[Leaf, ...]:
+        """Results that the function writes to arrays."""
+        return () if self.returns else self.results
 
 
-def argument_leaves(function: Callable[..., Any], examples: Sequence[Any]) -> list[Leaf]:
-    """Returns the argument arrays, named after the function's parameters and, in a tree, the path of the leaf."""
+def signature_of(function: Function, examples: Sequence[Any], shapes: Any) -> Signature:
+    """Returns the signature of a function, without costs, from example arguments and the shapes of its results.
+
+    Arguments are named after the function's parameters, results after their keys, or `result` if there are none. Leaves
+    of a tree have the path of the leaf too.
+    """
     try:
         names = list(inspect.signature(function).parameters)
     except (ValueError, TypeError):
         names = []
     names += [f"argument_{k}" for k in range(len(names), len(examples))]
-    leaves = [leaf for name, example in zip(names, examples, strict=False) for leaf in _leaves(name, example)]
-    return _checked(leaves, "argument")
-
-
-def result_leaves(shapes: Any, taken: Sequence[Leaf]) -> list[Leaf]:
-    """Returns the result arrays, named after their keys, or `result` if there are none."""
-    leaves = _leaves("", shapes) if jax.tree.structure(shapes) != jax.tree.structure(0) else _leaves("result", shapes)
-    used = {leaf.name for leaf in taken}
-    leaves = [leaf._replace(name=f"{leaf.name}_result") if leaf.name in used else leaf for leaf in leaves]
-    return _checked(leaves, "result")
-
-
-def array_of(leaf: Any) -> Any:
-    """Returns an array, a number as an array, or zeros for a shape."""
-    if isinstance(leaf, jax.ShapeDtypeStruct):
-        return np.zeros(leaf.shape, leaf.dtype)
-    return leaf if hasattr(leaf, "dtype") else np.asarray(leaf)
+    arguments = [leaf for name, example in zip(names, examples, strict=False) for leaf in _leaves(name, example)]
+    used = {leaf.name for leaf in arguments}
+    results = [leaf._replace(name=f"{leaf.name}_result") if leaf.name in used else leaf for leaf in _leaves("", shapes)]
+    for what, leaves in (("argument", arguments), ("result", results)):
+        require_once(f"the list of {what}s", [check_name(leaf.name, f"{what} name") for leaf in leaves])
+    return Signature(tuple(arguments), tuple(results))
 
 
 def _leaves(name: str, tree: Any) -> list[Leaf]:
     leaves = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
-        parts = [str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", "")))) for key in path]
-        whole = "_".join(part for part in (name, *parts) if part)
+        whole = "_".join(filter(None, (name, jax.tree_util.keystr(path, simple=True, separator="_")))) or "result"
         whole = f"result_{whole}" if whole[:1].isdigit() else whole
-        array = array_of(leaf)
-        leaves.append(Leaf(whole, kind_of(jax.dtypes.canonicalize_dtype(array.dtype)), tuple(map(int, array.shape))))
-    return leaves
-
-
-def _checked(leaves: list[Leaf], what: str) -> list[Leaf]:
-    names = [check_name(leaf.name, f"the name of {'an' if what == 'argument' else 'a'} {what}") for leaf in leaves]
-    if len(set(names)) < len(names):
-        raise InputError(f"two {what}s have one name among {', '.join(names)}; rename one")
+        leaves.append(Leaf(whole, kind_of(jax.dtypes.canonicalize_dtype(leaf.dtype)), tuple(leaf.shape)))
     return leaves
 
 
 def declaration(name: str, function: str, signature: Signature, real: str) -> str:
     """Returns the prototype of a function, without the semicolon."""
-    kinds, returned = {**KINDS, "real": real}, "void"
+    kinds = {**C_TYPES, "real": real}
 
     def array(leaf: Leaf) -> str:
         return f"{kinds[leaf.kind]} {leaf.name}[{max(prod(leaf.shape), 1)}]"  # C has no empty arrays
@@ -114,25 +106,26 @@ def declaration(name: str, function: str, signature: Signature, real: str) -> st
     parameters = [
         f"const {array(leaf)}" if leaf.shape else f"{kinds[leaf.kind]} {leaf.name}" for leaf in signature.arguments
     ]
-    if signature.returns:
-        returned = kinds[signature.results[0].kind]
-    else:
-        parameters += map(array, signature.results)
+    returned = kinds[signature.results[0].kind] if signature.returns else "void"
+    parameters += map(array, signature.written)
     return f"{returned} {name}_{function}({', '.join(parameters) or 'void'})"
 
 
 def description(
-    name: str, precision: str, version: str, functions: Mapping[str, Signature], files: Mapping[str, bytes]
+    name: str, precision: str, version: str, functions: Mapping[str, Signature], header: bytes, source: bytes
 ) -> bytes:
-    """Returns the JSON description of an export: its functions, and the digests of its files."""
+    """Returns the JSON description of an export: its functions, and a digest of itself, the header and the source."""
     # JSON turns leaves and shapes, which are tuples, into lists.
     stated = {
         key: {"arguments": function.arguments, "results": function.results, **function.cost._asdict()}
         for key, function in functions.items()
     }
     facts = {"format": FORMAT, "version": version, "name": name, "precision": precision, "functions": stated}
-    digests = {file: hashlib.sha256(content).hexdigest() for file, content in files.items()}
-    return json.dumps({**facts, "files": digests}, indent=2).encode() + b"\n"
+    return json.dumps({**facts, "digest": _digest(facts, header, source)}, indent=2).encode() + b"\n"
+
+
+def _digest(facts: Mapping[str, Any], header: bytes, source: bytes) -> str:
+    return hashlib.sha256(json.dumps(facts).encode() + header + source).hexdigest()
 
 
 def stated_costs(directory: str | Path, *, name: str = "model") -> dict[str, Cost]:
@@ -145,44 +138,30 @@ def stated_costs(directory: str | Path, *, name: str = "model") -> dict[str, Cos
 
 
 def read_interface(directory: Path, name: str) -> tuple[str, dict[str, Signature], dict[str, bytes]]:
-    """Returns the precision and the signatures of an export, checked against its header, and its files.
+    """Returns the precision and the signatures of an export, and its header and source, checked by their digest.
+
+    The digest detects accidents, such as an interrupted export or an edited file, and no forgery.
 
     Raises:
-        InputError: a file is missing or altered, the format differs, or the description contradicts the header.
+        InputError: a file is missing or altered, or the format differs.
     """
-    path, files = directory / f"{name}.json", {}
-    stated = read_json(path, remedy=f"{AGAIN}, and keep its files together")
+    path = directory / f"{name}.json"
+    stated = read_json(path, remedy="export it again, and keep its files together")
     if stated.get("format") != FORMAT:
-        raise InputError(f"{path}: C format {stated.get('format')!r}; this release reads format {FORMAT}, so {AGAIN}")
+        raise InputError(
+            f"{path}: C format {stated.get('format')!r}; this release reads format {FORMAT}, so export it again"
+        )
     try:
-        for file in (path.with_suffix(".h"), path.with_suffix(".c")):
-            files[file.name] = file.read_bytes()
-            if hashlib.sha256(files[file.name]).hexdigest() != stated["files"][file.name]:
-                raise InputError(f"{file.name} is truncated or altered, by its SHA-256")
-        precision, header = stated["precision"], files[f"{name}.h"].decode(errors="replace")
-        if stated["name"] != name or precision not in PRECISIONS:
-            raise InputError(f"name is {stated['name']!r:.60} and precision {precision!r:.60}")
-        functions = {str(key): _signature(value) for key, value in dict(stated["functions"]).items()}
-        for key, function in functions.items():
-            if f"{declaration(name, check_name(key), function, PRECISIONS[precision][1])};" not in header:
-                raise InputError(f"{key} is not declared so in {name}.h")
+        files = {file.name: file.read_bytes() for file in (path.with_suffix(".h"), path.with_suffix(".c"))}
     except OSError as error:
-        raise InputError(f"{error.filename}: cannot be read ({error.strerror}); {AGAIN}") from error
-    except (InputError, TypeError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: does not describe the files beside it ({error!s:.200}); {AGAIN}") from error
-    return precision, functions, files
-
-
-def _signature(stated: Any) -> Signature:
-    def checked(name: str, kind: str, shape: list[int]) -> Leaf:
-        leaf = Leaf(check_name(name), kind, tuple(shape))
-        counts = all(type(size) is int and size >= 0 for size in shape)
-        if kind not in KINDS or not counts or prod(shape) > LARGEST:
-            raise InputError(f"{name} is {leaf}")
-        return leaf
-
-    arguments, results = (tuple(checked(*leaf) for leaf in stated[key]) for key in ("arguments", "results"))
-    numbers = {field: stated[field] for field in Cost._fields}
-    if not all(type(count) is int and count >= 0 for count in numbers.values()):
-        raise InputError(f"a cost is {numbers}")
-    return Signature(arguments, results, Cost(**numbers))
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror}); export it again") from error
+    if stated.pop("digest", None) != _digest(stated, *files.values()) or stated["name"] != name:
+        raise InputError(f"{path}: it, {name}.h or {name}.c is altered, renamed or of another export; export it again")
+    signatures = {}
+    for key, values in stated["functions"].items():
+        arguments, results = (
+            tuple(Leaf(leaf, kind, tuple(shape)) for leaf, kind, shape in values[part])
+            for part in ("arguments", "results")
+        )
+        signatures[key] = Signature(arguments, results, Cost(*(values[field] for field in Cost._fields)))
+    return stated["precision"], signatures, files

@@ -6,9 +6,8 @@ no library but <math.h>. The same functions, name and precision give the same fi
 
 import functools
 import importlib.metadata
-import re
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +19,19 @@ from dln_jax.export.c.body import Source
 from dln_jax.export.c.emit import body_of
 from dln_jax.export.c.interface import (
     FORMAT,
+    Function,
     Signature,
-    argument_leaves,
-    array_of,
     declaration,
     description,
-    result_leaves,
+    signature_of,
 )
 from dln_jax.export.c.lowering import program_of, repeated_calls, traced
-from dln_jax.export.c.templates import CASADI_ABOUT, CASADI_BUILD, NEEDED, about, cmake, demo, header, preamble
+from dln_jax.export.c.templates import CMAKE, NEEDED, demo, header, preamble
 from dln_jax.export.c.text import PRECISIONS, check_name, comment, kind_of
-from dln_jax.export.exports import write_exports
-from dln_jax.precision import computing_in
+from dln_jax.files import write_bytes
+from dln_jax.precision import computing_in, require_precision
 from dln_jax.types import InputError, require_positive
 
-Functions = Mapping[str, tuple[Callable[..., Any], Sequence[Any]]]
-"""Functions of arrays by name, with example arguments."""
 STACK = 256 * 1024
 """Default limit in bytes of the stack that a function may use."""
 LENGTH = 10_000_000
@@ -44,17 +40,12 @@ LINES = 4000
 """A function of more lines, including callees, is not exported by default."""
 
 
-class TooLargeError(InputError):
-    """A function needs more stack, or more lines, than suits generated C."""
-
-
 def export_c(
-    functions: Functions,
+    functions: Mapping[str, tuple[Function, Sequence[Any]]],
     directory: str | Path,
     *,
     name: str = "model",
     precision: str | None = None,
-    libm: bool = False,
     casadi: bool | Collection[str] = False,
     leave_out_large: bool = False,
     stack: int = STACK,
@@ -71,7 +62,6 @@ def export_c(
         directory: folder of the export; created if missing.
         name: a C name; every file and public function starts with it.
         precision: f32 or f64, for all real numbers; default: the precision of the examples.
-        libm: call the C library's exp, expm1, tanh, sin, cos, log and log1p instead of vectorisable ones.
         casadi: also write NAME_casadi.c: all functions, or those named, with exact derivatives for CasADi's `external`.
         leave_out_large: omit functions that exceed the stack or 4,000 lines (which take seconds to compile), and from
             NAME_casadi.c functions that CasADi cannot take; the files list the omitted functions.
@@ -86,146 +76,137 @@ def export_c(
         InputError: a function cannot be written in C or needs more stack, a name is invalid in C, the source exceeds 10
             MB, files exist, or the folder belongs to a run, whose files are never replaced.
     """
-    texts = source_files(
-        functions, name=check_name(name), precision=precision, libm=libm, casadi=casadi,
-        leave_out_large=leave_out_large, stack=stack, finite=finite, loop_bound=loop_bound,
-    )  # fmt: skip
-    return write_exports(Path(directory), texts, overwrite=overwrite)
-
-
-def source_files(
-    functions: Functions,
-    *,
-    name: str,
-    precision: str | None = None,
-    libm: bool = False,
-    casadi: bool | Collection[str] = False,
-    leave_out_large: bool = False,
-    stack: int = STACK,
-    finite: bool = False,
-    loop_bound: int | None = None,
-) -> dict[str, bytes]:
-    """Returns the contents of the files by name; arguments as for `export_c`."""
     require_positive(stack=stack, loop_bound=1 if loop_bound is None else loop_bound)
+    check_name(name)
     if not functions:
         raise InputError("there is no function to export; give at least one, as {'name': (function, examples)}")
+    chosen: dict[str, tuple[Function, Any]] = {}
     for key, pair in functions.items():
         if not (isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[1], tuple | list)):
             raise InputError(
                 f"{key} is {pair!r:.60}; expected (function, examples), one example for each argument: (f, (x,))"
             )
-    functions = {key: (_in_written_order(function), examples) for key, (function, examples) in functions.items()}
-    precision = precision or _precision(functions)
-    if precision not in PRECISIONS:
-        raise InputError(f"precision is {precision!r}; expected f32 or f64")
+        chosen[check_name(key, "the name of a function")] = _in_written_order(pair[0]), tuple(pair[1])
+    if precision is None:
+        types = {str(_dtype(leaf)) for leaf in jax.tree.leaves([examples for _, examples in chosen.values()])}
+        precision = "f32" if "float32" in types and "float64" not in types else "f64"
+    require_precision(precision)
+    if casadi and precision != "f64":
+        raise InputError("CasADi computes in double; export with precision f64")
+    version = importlib.metadata.version("dln-jax")
+    written_by = f"Written by dln-jax {version}, C format {FORMAT}."
+    empty = Source(precision, finite, loop_bound)
+    source = empty.copy()
+    signatures: dict[str, Signature] = {}
+    texts, left_out = [], []
     with computing_in(precision):
-        source, signatures, texts, left_out = _exported(
-            functions, Source(precision, libm, finite, loop_bound), name, leave_out_large, stack
-        )
-        version = importlib.metadata.version("dln-jax")
-        written_by = f"Written by dln-jax {version}, C format {FORMAT}."
+        every = {key: _traced(key, *pair, precision) for key, pair in chosen.items()}
+        repeated = repeated_calls([closed for _, closed in every.values()])
+        for key, (signature, closed) in every.items():
+            with_function = source.copy()
+            signature, text, lines = _function(with_function, name, key, signature, closed, repeated)
+            if (used := signature.cost.stack_bytes) > stack:
+                large = f"{key} would take {used / 1024:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB"
+            elif leave_out_large and lines > LINES:
+                large = f"{key}, of {lines} lines"
+            else:
+                source, signatures[key] = with_function, signature
+                texts.append(text)
+                continue
+            if not leave_out_large:
+                raise InputError(large)
+            left_out.append(f"Left out: {large}; ask for it by name.")
         text = "".join([*(part.text for part in source.parts.values()), *texts])
         files = {
             f"{name}.h": header(name, written_by, signatures, precision, left_out),
             f"{name}.c": comment(f"{name}.c", written_by, NEEDED) + preamble(source, name, text) + text,
             f"{name}_demo.c": demo(name, signatures, precision),
-            "CMakeLists.txt": cmake(name),
+            "CMakeLists.txt": CMAKE.format(name=name),
         }
         if casadi:
-            if precision != "f64":
-                raise InputError("CasADi computes in double; export with precision f64")
-            chosen = {key: functions[key] for key in signatures if casadi is True or key in casadi}
+            of_casadi = {key: chosen[key] for key in signatures if casadi is True or key in casadi}
             source, text, left_out = external.external_functions(
-                name, chosen, Source("f64", libm, finite, loop_bound), stack=stack, leave_out=leave_out_large
+                name, of_casadi, empty, stack=stack, leave_out=leave_out_large
             )
-            title = about(CASADI_ABOUT.format(name=name, written_by=written_by), left_out=left_out)
+            title = comment(external.ABOUT.format(name=name, written_by=written_by), *left_out)
             files[f"{name}_casadi.c"] = title + preamble(source, name, text) + text
-            files["CMakeLists.txt"] += CASADI_BUILD.format(name=name)
+            files["CMakeLists.txt"] += external.BUILD.format(name=name)
     if (longest := max(map(len, files.values()))) > LENGTH:
         raise InputError(f"the source would take {longest / 1e6:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")
     encoded = {file_name: text.encode() for file_name, text in files.items()}
-    return {**encoded, f"{name}.json": description(name, precision, version, signatures, encoded)}
+    stated = description(name, precision, version, signatures, encoded[f"{name}.h"], encoded[f"{name}.c"])
+    return _write(Path(directory), {**encoded, f"{name}.json": stated}, overwrite)
 
 
-def _in_written_order(function: Callable[..., Any]) -> Callable[..., Any]:
+def _dtype(leaf: Any) -> np.dtype:
+    return leaf.dtype if hasattr(leaf, "dtype") else np.dtype(type(leaf))
+
+
+def _in_written_order(function: Function) -> Function:
     """Returns the function with its results in the order in which a dictionary was written; JAX would sort the keys."""
 
-    def ordered(tree: Any) -> Any:
+    def ordered(tree):
         return OrderedDict((key, ordered(value)) for key, value in tree.items()) if type(tree) is dict else tree
 
     @functools.wraps(function)
-    def call(*arguments: Any) -> Any:
+    def call(*arguments):
         return ordered(function(*arguments))
 
     return call
 
 
-def _precision(functions: Functions) -> str:
-    types = [array_of(leaf).dtype for leaf in jax.tree.leaves([examples for _, examples in functions.values()])]
-    sizes = {dtype.itemsize for dtype in types if jax.numpy.issubdtype(dtype, np.floating)}
-    return "f64" if max(sizes, default=8) == 8 else "f32"
-
-
-def _exported(
-    functions: Functions, source: Source, name: str, leave_out_large: bool, stack: int
-) -> tuple[Source, dict[str, Signature], list[str], list[str]]:
-    """Returns the source, signatures and texts of the functions, and reasons for those left out."""
-    signatures, texts, left_out = {}, [], []
-    every = {
-        check_name(key, "the name of a function"): _traced(key, *pair, source.precision)
-        for key, pair in functions.items()
-    }
-    repeated = repeated_calls([closed for _, closed in every.values()])
-    for key, (signature, closed) in every.items():
-        with_function = source.copy()
-        try:
-            signature, text, lines = _function(with_function, name, key, signature, closed, repeated, stack)
-            if leave_out_large and lines > LINES:
-                raise TooLargeError(f"{key}, of {lines} lines")
-        except TooLargeError as error:
-            if not leave_out_large:
-                raise
-            left_out.append(f"{error}; ask for it by name.")
-            continue
-        source, signatures[key] = with_function, signature
-        texts.append(text)
-    return source, signatures, texts, left_out
-
-
-def _traced(key: str, function: Callable[..., Any], examples: Sequence[Any], precision: str) -> tuple[Signature, Any]:
+def _traced(key: str, function: Function, examples: Any, precision: str) -> tuple[Signature, Any]:
     """Returns the signature, without costs, and the closed jaxpr of a function."""
 
-    def cast(leaf: Any) -> np.ndarray:
-        array = array_of(leaf)
-        return np.asarray(array, PRECISIONS[precision][0] if kind_of(array.dtype) == "real" else None)
+    def shape_of(leaf):
+        dtype = PRECISIONS[precision][0] if kind_of(_dtype(leaf)) == "real" else _dtype(leaf)
+        return jax.ShapeDtypeStruct(np.shape(leaf), dtype)
 
     try:
-        examples = jax.tree.map(cast, tuple(examples))
-        arguments = argument_leaves(function, examples)
+        examples = jax.tree.map(shape_of, examples)
         closed, shapes = traced(function, examples)
-        return Signature(tuple(arguments), tuple(result_leaves(shapes, arguments))), closed
+        return signature_of(function, examples, shapes), closed
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
 
 
 def _function(
-    source: Source, name: str, key: str, signature: Signature, closed: Any, repeated: Collection[int], stack: int
+    source: Source, name: str, key: str, signature: Signature, closed: Any, repeated: Collection[int]
 ) -> tuple[Signature, str, int]:
     """Returns the signature with costs, the C text, and the number of lines of a function, including callees."""
     named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(signature.arguments)}
-    targets = [] if signature.returns else [leaf.name for leaf in signature.results]
+    targets = [leaf.name for leaf in signature.written]
     try:
         program, _, results = program_of(closed, repeated, precision=source.precision, finite=source.finite)
         body = body_of(source, program, results, named, targets)
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
-    if body.stack > stack:
-        raise TooLargeError(
-            f"{key} would take {body.stack / 1024:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB"
-        )
-    words = set(re.findall(r"\w+", "\n".join(body.lines)))
-    leaves = [*signature.arguments, *(() if signature.returns else signature.results)]
-    lines = "\n".join([*(f"    (void){leaf.name};" for leaf in leaves if leaf.name not in words), *body.lines])
+    unused = [f"    (void){leaf.name};" for leaf in [*signature.arguments, *signature.written]]
+    lines = "\n".join(unused + body.lines)
     text = f"\n{declaration(name, key, signature, 'real')}\n{{\n{lines}\n}}\n"
     total = len(body.lines) + sum(source.parts[part].text.count("\n") for part in body.calls)
     return signature._replace(cost=body.cost), text, total
+
+
+def _write(directory: Path, files: Mapping[str, bytes], overwrite: bool) -> list[Path]:
+    """Writes the files, the description last: an interrupted export differs from its digest, which `load_c` refuses."""
+    for path in filter(Path.is_file, directory.glob("*.json")):
+        text = path.read_bytes()
+        if b'"tensor_file"' in text:
+            raise InputError(f"{directory} is the folder of a run; export to another, such as {directory / 'exported'}")
+        if path.name in files and b'"functions"' not in text:
+            raise InputError(f"{path} describes no export; choose another folder or name")
+    existing = [path for name in files if (path := directory / name).exists()]
+    for path in existing:
+        if not path.is_file():
+            raise InputError(f"{path} is not a file and cannot be replaced; choose another folder or name")
+    if existing and not overwrite:
+        names = ", ".join(path.name for path in existing)
+        raise InputError(f"{directory} holds {names} already; choose another folder or overwrite them")
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{directory}: cannot write there ({error.strerror}); choose another folder") from error
+    for name, content in files.items():
+        write_bytes(directory / name, content)
+    return [directory / name for name in files]

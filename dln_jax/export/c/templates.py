@@ -6,14 +6,15 @@ from math import prod
 
 from dln_jax.export.c import elementary, factorisations, kernels, operations
 from dln_jax.export.c.body import Source
-from dln_jax.export.c.interface import KINDS, Cost, Signature, declaration
-from dln_jax.export.c.text import PRECISIONS, comment, fill, table
+from dln_jax.export.c.interface import Cost, Signature, declaration
+from dln_jax.export.c.text import C_TYPES, PRECISIONS, comment, fill, table
 
 _PROMISES = """Functions of one state. Their workspace is on the stack, so they may run in several threads.
 Results may overlap arguments, as updates in place do, but not each other: all arguments are read before results are
 written. NaN and infinities in a state propagate to the results."""
 NEEDED = """C99; needs <math.h>, <float.h> and <stdint.h>, and nothing else. Fastest with -O3 for the processor at hand
-(gcc: -march=native); does not compile with -ffast-math, which gives wrong numbers."""
+(gcc: -march=native) and -DDLN_OWN_ELEMENTARY, which replaces the C library's exp, tanh, sin and others by functions
+that vectorise; does not compile with -ffast-math, which gives wrong numbers."""
 _PREAMBLE = """\
 #include <float.h>
 #include <math.h>
@@ -61,131 +62,19 @@ $declared
 
 #endif
 """
-CASADI_DECLARATIONS = """
-typedef double casadi_real;
-typedef long long int casadi_int;
-
-#ifdef __cplusplus
-#define EXPORTED extern "C"
-#else
-#define EXPORTED
-#endif
-/* CasADi's queries about a function. The function has no state that needs reference counts, and its workspace is on
-   the stack. */
-#define DESCRIBED(f, inputs, outputs) \\
-    EXPORTED void f##_incref(void) {} \\
-    EXPORTED void f##_decref(void) {} \\
-    EXPORTED casadi_int f##_n_in(void) { return inputs; } \\
-    EXPORTED casadi_int f##_n_out(void) { return outputs; } \\
-    EXPORTED const char *f##_name_in(casadi_int i) { return f##_names[i]; } \\
-    EXPORTED const char *f##_name_out(casadi_int i) { return f##_names[inputs + i]; } \\
-    EXPORTED const casadi_int *f##_sparsity_in(casadi_int i) { return f##_sparsities[i]; } \\
-    EXPORTED const casadi_int *f##_sparsity_out(casadi_int i) { return f##_sparsities[inputs + i]; } \\
-    EXPORTED int f(const casadi_real **arg, casadi_real **res, casadi_int *integers, casadi_real *reals, int memory)
-"""
-CASADI_FUNCTION = """
-/* {cost} */
-static const char *const {symbol}_names[] = {{{names}}};
-static const casadi_int {symbol}_sparsities[][{length}] = {{{sparsities}}};
-DESCRIBED({symbol}, {inputs}, {outputs})
-{{
-{lines}
-}}
-"""
-CASADI_ABOUT = """{name}_casadi.c: functions of {name}.h with exact derivatives, for CasADi 3.6 and later.
-{written_by}
-
-cmake -B build && cmake --build build, then in Python, with the name of one of the functions for F:
-F = casadi.external("casadi_{name}_F", "build/lib{name}.so")
-
-acados loads the same library; its folder is model_external_shared_lib_dir, and its name, {name},
-model_external_shared_lib_name among the solver's options."""
-CASADI_BUILD = """
-# The library that CasADi and acados load
-add_library({name}_casadi SHARED {name}.c {name}_casadi.c)
-set_target_properties({name}_casadi PROPERTIES OUTPUT_NAME {name} ARCHIVE_OUTPUT_NAME {name}_casadi
-  C_STANDARD 99 C_EXTENSIONS OFF WINDOWS_EXPORT_ALL_SYMBOLS ON)
-if(UNIX)
-  target_link_libraries({name}_casadi PRIVATE m)
-endif()
-"""
-_START = """#include <stdio.h>
-#include <stdlib.h>
-#include <time.h>
-
-#include "{name}.h"
-
-/* Uniform in [-1, 1), the same on every machine */
-static unsigned long seed_ = 1;
-
-static {real} uniform_(void)
-{{
-    seed_ = (1103515245UL * seed_ + 12345UL) & 0x7fffffffUL;
-    return ({real})seed_ / ({real})0x40000000UL - 1;
-}}
-
-int main(int arguments_, char **argument_)
-{{
-    const long calls_ = arguments_ > 1 ? atol(argument_[1]) : 0;
-"""
-_TIMED = """        if (calls_ > 0) {{
-            const clock_t start_ = clock();
-            clock_t end_ = start_;
-            double made_ = 0;
-            while (end_ == start_) {{ /* again if the clock has not moved */
-                for (long k_ = 0; k_ < calls_; ++k_) {{ {moved}{call}; }}
-                made_ += (double)calls_;
-                end_ = clock();
-            }}
-            const double each_ = (double)(end_ - start_) / CLOCKS_PER_SEC / made_;
-            printf("{function}: %.0f calls/s, %.3f us each\\n", 1 / each_, 1e6 * each_);
-        }}
-"""
-
-
-def demo(name: str, functions: Mapping[str, Signature], precision: str) -> str:
-    """Returns NAME_demo.c, which prints every function at one state and, with an argument N, times N calls.
-
-    Real arguments are random, except that a time step `dt` is a millisecond.
-    """
-    real = PRECISIONS[precision][1]
-    kinds = {**KINDS, "real": real}
-    text = comment(
-        f"{name}_demo.c: prints the results of the functions of {name}.h at one state.",
-        f"cc -std=c99 -O3 -march=native {name}.c {name}_demo.c -lm -o {name}_demo\n"
-        f"./{name}_demo 1000000    also times a million calls of each",
-    ) + _START.format(name=name, real=real)
-    for key, function in functions.items():
-        leaves = [*function.arguments, *function.results]
-        names = [leaf.name if leaf.shape else f"{leaf.name}[0]" for leaf in leaves]
-        call = f"{name}_{key}({', '.join(names[: len(names) - function.returns])})"
-        call = f"{names[-1]} = {call}" if function.returns else call
-        lines = [f"static {kinds[leaf.kind]} {leaf.name}[{max(prod(leaf.shape), 1)}];" for leaf in leaves]
-        for leaf in function.arguments:
-            value = "uniform_()" if leaf.kind == "real" else "0"
-            value = f"({real})1e-3" if leaf.name == "dt" else value  # discrete-time steps have this argument
-            lines.append(f"for (int i_ = 0; i_ < {prod(leaf.shape)}; ++i_) {leaf.name}[i_] = {value};")
-        lines.append(f"{call};")
-        for leaf in function.results:
-            printed = f'printf(" %.9g", (double){leaf.name}[i_]);'
-            lines += [f'printf("{key} {leaf.name}:");', f"for (int i_ = 0; i_ < {prod(leaf.shape)}; ++i_) {printed}"]
-            lines.append('printf("\\n");')
-        # The state changes between calls, so that the compiler cannot remove any.
-        first = next((leaf.name for leaf in function.arguments if leaf.kind == "real"), None)
-        moved = f"{first}[0] += ({real})1e-6; " if first else ""
-        text += "    {\n" + "".join(f"        {line}\n" for line in lines)
-        text += _TIMED.format(moved=moved, call=call, function=f"{name}_{key}") + "    }\n"
-    return text + "    return 0;\n}\n"
-
-
-def cmake(name: str) -> str:
-    """Returns CMakeLists.txt, which builds the model as a library, and the demo."""
-    return f"""# Builds the model as a library and its demo: cmake -B build && cmake --build build
+CMAKE = """# Builds the model as a library and its demo: cmake -B build && cmake --build build
 cmake_minimum_required(VERSION 3.10)
 project({name} C)
 
 if(NOT CMAKE_BUILD_TYPE)
   set(CMAKE_BUILD_TYPE Release)
+endif()
+
+# Functions that vectorise in place of the C library's exp, tanh, sin and others. They pay with the vector instructions
+# of the processor at hand (-DCMAKE_C_FLAGS=-march=native), and are slower than the library's without them.
+option(DLN_OWN_ELEMENTARY "Use the model's own exp, tanh, sin and others" OFF)
+if(DLN_OWN_ELEMENTARY)
+  add_definitions(-DDLN_OWN_ELEMENTARY)
 endif()
 
 add_library({name} {name}.c)
@@ -199,6 +88,80 @@ add_executable({name}_demo {name}_demo.c)
 set_target_properties({name}_demo PROPERTIES C_STANDARD 99 C_EXTENSIONS OFF)
 target_link_libraries({name}_demo PRIVATE {name})
 """
+"""CMakeLists.txt, which builds the model as a library, and the demo."""
+_DEMO = """#include <stdio.h>
+#include <stdlib.h>
+#include <time.h>
+
+#include "$name.h"
+
+typedef $real real;
+
+/* Uniform in [-1, 1), the same on every machine */
+static unsigned long seed_ = 1;
+
+static real uniform_(void)
+{
+    seed_ = (1103515245UL * seed_ + 12345UL) & 0x7fffffffUL;
+    return (real)seed_ / (real)0x40000000UL - 1;
+}
+
+#define FILL_(x, n, value) for (int i_ = 0; i_ < n; ++i_) x[i_] = value
+#define PRINT_(name, x, n) \\
+    printf(name ":"); \\
+    for (int i_ = 0; i_ < n; ++i_) printf(" %.9g", (double)x[i_]); \\
+    printf("\\n")
+/* Repeated calls, again if the clock has not moved. The state changes between them, so that none can be removed */
+#define TIME_(name, change, call) \\
+    if (calls_ > 0) { \\
+        const clock_t start_ = clock(); \\
+        clock_t end_ = start_; \\
+        double made_ = 0; \\
+        while (end_ == start_) { \\
+            for (long k_ = 0; k_ < calls_; ++k_) { change; call; } \\
+            made_ += (double)calls_; \\
+            end_ = clock(); \\
+        } \\
+        const double each_ = (double)(end_ - start_) / CLOCKS_PER_SEC / made_; \\
+        printf(name ": %.0f calls/s, %.3f us each\\n", 1 / each_, 1e6 * each_); \\
+    }
+
+int main(int arguments_, char **argument_)
+{
+    const long calls_ = arguments_ > 1 ? atol(argument_[1]) : 0;
+$blocks    return 0;
+}
+"""
+
+
+def demo(name: str, functions: Mapping[str, Signature], precision: str) -> str:
+    """Returns NAME_demo.c, which prints every function at one state and, with an argument N, times N calls.
+
+    Real arguments are random, except that a time step `dt` is a millisecond.
+    """
+    blocks = ""
+    for key, function in functions.items():
+        leaves = [*function.arguments, *function.results]
+        names = [leaf.name if leaf.shape else f"{leaf.name}[0]" for leaf in leaves]
+        call = f"{name}_{key}({', '.join(names[: len(names) - function.returns])})"
+        call = f"{names[-1]} = {call}" if function.returns else call
+        lines = [f"static {C_TYPES[leaf.kind]} {leaf.name}[{max(prod(leaf.shape), 1)}];" for leaf in leaves]
+        change = "(void)0"
+        for leaf in reversed(function.arguments):
+            value = "0"
+            if leaf.kind == "real":
+                change = f"{leaf.name}[0] += (real)1e-6"
+                value = "(real)1e-3" if leaf.name == "dt" else "uniform_()"  # discrete-time steps have this argument
+            lines.append(f"FILL_({leaf.name}, {prod(leaf.shape)}, {value});")
+        lines.append(f"{call};")
+        lines += [f'PRINT_("{key} {leaf.name}", {leaf.name}, {prod(leaf.shape)});' for leaf in function.results]
+        lines.append(f'TIME_("{name}_{key}", {change}, {call})')
+        blocks += "    {\n" + "".join(f"        {line}\n" for line in lines) + "    }\n"
+    return comment(
+        f"{name}_demo.c: prints the results of the functions of {name}.h at one state.",
+        f"cc -std=c99 -O3 -march=native -DDLN_OWN_ELEMENTARY {name}.c {name}_demo.c -lm -o {name}_demo\n"
+        f"./{name}_demo 1000000    also times a million calls of each",
+    ) + fill(_DEMO, precision, name=name, blocks=blocks)
 
 
 def preamble(source: Source, name: str, text: str) -> str:
@@ -226,11 +189,10 @@ def header(
     """Returns the header: the prototype of every function, the shapes of its results and its cost."""
     declared = ""
     for key, signature in signatures.items():
-        shapes = "".join(f"{leaf.name} {list(leaf.shape)}, " for leaf in signature.results if leaf.shape)
-        facts = stated(signature.cost)
+        results = ", ".join(leaf.described for leaf in signature.results)
         prototype = declaration(name, key, signature, PRECISIONS[precision][1])
-        declared += f"\n/* {f'{shapes[:-2]}; ' if shapes else ''}{facts} */\n{prototype};\n"
-    text = about(f"{name}.h", written_by, _PROMISES, left_out=left_out)
+        declared += f"\n/* {results}; {stated(signature.cost)} */\n{prototype};\n"
+    text = comment(f"{name}.h", written_by, _PROMISES, *left_out)
     return text + fill(_HEADER, precision, guard=f"{name.upper()}_H", declared=declared)
 
 
@@ -241,9 +203,3 @@ def stated(cost: Cost) -> str:
     kinds += [f"unbounded loops, with one iteration counted {cost.unbounded_loops}"] * bool(cost.unbounded_loops)
     text = f"at most {cost.operations} floating-point operations, {cost.stack_bytes} bytes of stack"
     return text + f"\n   ({', '.join(kinds)})" * bool(kinds)
-
-
-def about(*paragraphs: str, left_out: Sequence[str]) -> str:
-    """Returns a comment that also lists the functions left out, with reasons."""
-    absent = "\n".join(f"Left out: {reason}" for reason in left_out)
-    return comment(*paragraphs, *[absent] * bool(absent))

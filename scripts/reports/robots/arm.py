@@ -22,9 +22,9 @@ from dln_jax import Model, tree_system
 from dln_jax.data.robot_files import mjcf
 from dln_jax.data.robots import Robot, compiled_model
 from dln_jax.data.schema import Trajectories, from_arrays
-from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
+from dln_jax.export.functions import functions_of_system
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees.description import Tree, serial
 from dln_jax.mechanics.trees.inertia import inertial_parameters

@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.interface import Signature, read_interface, stated_costs
 from dln_jax.export.c.load import FLAGS, STANDARD, compile_c, load_c
 from dln_jax.export.c.source import export_c
+from dln_jax.export.functions import functions_of_system
 from dln_jax.mechanics.discrete import linearised
 from dln_jax.mechanics.integrators import rk4
 from dln_jax.precision import data_type

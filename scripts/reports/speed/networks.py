@@ -14,7 +14,8 @@ from jax import Array
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import Split, select
 from dln_jax.export.c.load import load_c
-from dln_jax.export.c.run import export_run
+from dln_jax.export.c.source import export_c
+from dln_jax.export.functions import functions_of_run
 from dln_jax.export.low_latency import enable_low_latency
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
@@ -177,7 +178,7 @@ def times_of(folder: Path, dispatch: str, calls: int) -> dict[str, dict[str, flo
         return {"default-jit": times(jitted, device)}
     with tempfile.TemporaryDirectory() as place:
         export, name = Path(place), "inverse_dynamics"
-        export_run(folder, export, name="model", functions=(name,))
+        export_c(functions_of_run(run, names=[name]), export)
         loop = timed(
             programs(export, compiled(export, export), [name])[name], repeats=3, calls=20 * calls, cold=0, mebibytes=0
         )

@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+import tempfile
 
 import jax
 import numpy as np
@@ -39,7 +40,8 @@ def in_c(functions, states, folder, *, precision="f64", flags=("-O1",), **option
     export_c(at, folder, precision=precision, **options)
     if precision == "f32":
         assert "double" not in (folder / "model.c").read_text()
-    loaded = load_c(folder, flags=(*flags, *STRICT))
+    own = ["-DDLN_OWN_ELEMENTARY"] * (precision == "f64")  # the functions of the C library in f32
+    loaded = load_c(folder, flags=(*flags, *own, *STRICT))
     results = {}
     for name in functions:
         call = getattr(loaded, name)
@@ -48,6 +50,12 @@ def in_c(functions, states, folder, *, precision="f64", flags=("-O1",), **option
         rows = [row if isinstance(row, tuple) else (row,) for row in rows]
         results[name] = [np.stack([np.asarray(result) for result in column]) for column in zip(*rows, strict=True)]
     return results
+
+
+def files_of(functions, name="model", **options):
+    """The contents of an export's files, by name."""
+    with tempfile.TemporaryDirectory() as folder:
+        return {path.name: path.read_bytes() for path in export_c(functions, folder, name=name, **options)}
 
 
 def in_order(tree):

@@ -7,13 +7,13 @@ from math import prod
 import numpy as np
 from comparison import STRICT
 
-from dln_jax.export.c.interface import KINDS, read_interface
+from dln_jax.export.c.interface import read_interface
 from dln_jax.export.c.load import compile_c
 from dln_jax.export.c.source import export_c
-from dln_jax.export.c.text import NUMPY_TYPES
+from dln_jax.export.c.text import C_TYPES, NUMPY_TYPES
 
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-FLAGS = ("-std=c99", "-pedantic", *STRICT, "-g", "-O1", *SANITIZERS)
+FLAGS = ("-std=c99", "-pedantic", *STRICT, "-g", "-O1", "-DDLN_OWN_ELEMENTARY", *SANITIZERS)
 
 
 def in_sanitized_c(functions, states, folder, **options):
@@ -70,7 +70,7 @@ def _calls(name, signature, count):
     text = f"    for (int k = 0; k < {count}; ++k) {{\n"
     passed = []
     for place, leaf in enumerate([*signature.arguments, *signature.results]):
-        text += f"        {KINDS[leaf.kind].replace('real', 'double')} x{place}[{max(prod(leaf.shape), 1)}];\n"
+        text += f"        {C_TYPES[leaf.kind].replace('real', 'double')} x{place}[{max(prod(leaf.shape), 1)}];\n"
         if place < len(signature.arguments):
             text += f"        take(x{place}, sizeof *x{place}, {prod(leaf.shape)});\n"
             passed.append(f"x{place}" if leaf.shape else f"*x{place}")

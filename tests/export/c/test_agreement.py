@@ -15,8 +15,8 @@ from planar_arm import ARM
 from test_families import MODELS, run_of, states_of
 
 from dln_jax import joint_dissipation, tree_system
-from dln_jax.export.c.families import functions_of_run, functions_of_system
 from dln_jax.export.c.load import FLAGS
+from dln_jax.export.functions import functions_of_run, functions_of_system
 from dln_jax.mechanics.friction import LAWS, coefficients_of
 from dln_jax.mechanics.joint_friction import Load, with_friction
 from dln_jax.mechanics.lagrangian import LagrangianSystem

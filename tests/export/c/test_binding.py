@@ -56,7 +56,6 @@ def test_any_real_numbers_of_the_shape_are_taken(loaded):
             result = functions.matrix(a, k)
             assert result.dtype == real and result.shape == (3, 2)
             np.testing.assert_array_equal(result, 2 * MATRIX.T)
-    np.testing.assert_array_equal(functions.matrix(k=2, a=MATRIX), functions.matrix(MATRIX, k=2))
 
 
 def test_results_are_new_arrays_and_numbers(loaded):
@@ -96,20 +95,19 @@ def test_threads_may_call_at_once(loaded):
 
 
 REFUSED = [
-    ((MATRIX,), {}, "matrix takes a, k; missing a required argument: 'k'$"),
-    ((MATRIX, 1.0, 2.0), {}, "matrix takes a, k; too many positional arguments$"),
-    ((MATRIX,), {"k": 1.0, "j": 1.0}, "matrix takes a, k; got an unexpected keyword argument 'j'$"),
-    ((MATRIX.T, 1.0), {}, r"a has shape \(3, 2\); expected \(2, 3\)"),
-    ((0.1, 1.0), {}, r"a has shape \(\)"),
-    ((MATRIX, [1.0]), {}, r"k has shape \(1,\)"),
-    ((MATRIX, "1"), {}, "k has type <U1; expected real numbers"),
-    ((MATRIX + 1j, 1.0), {}, "a has type complex128"),
-    ((None, 1.0), {}, "a has type object"),
-    (([1, [2]], 1.0), {}, "a is not an array"),
+    ((MATRIX,), "matrix takes a, k; got 1 arguments$"),
+    ((MATRIX, 1.0, 2.0), "matrix takes a, k; got 3 arguments$"),
+    ((MATRIX.T, 1.0), r"a has shape \(3, 2\); expected \(2, 3\)"),
+    ((0.1, 1.0), r"a has shape \(\)"),
+    ((MATRIX, [1.0]), r"k has shape \(1,\)"),
+    ((MATRIX, "1"), "k has type <U1; expected real numbers"),
+    ((MATRIX + 1j, 1.0), "a has type complex128"),
+    ((None, 1.0), "a has type object"),
+    (([1, [2]], 1.0), "a has type object"),
 ]
 
 
 def test_others_are_refused_by_name(loaded):
-    for args, kwargs, message in REFUSED:
+    for args, message in REFUSED:
         with one_line(message):
-            loaded[0].matrix(*args, **kwargs)
+            loaded[0].matrix(*args)

@@ -14,9 +14,9 @@ from comparison import STRICT, in_order, needs_compiler
 
 from dln_jax.export.c import casadi as external_c
 from dln_jax.export.c.body import Source
-from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import compile_c
 from dln_jax.export.c.source import export_c
+from dln_jax.export.functions import functions_of_system
 from dln_jax.scenes.pendulums import pendulum
 
 casadi = pytest.importorskip("casadi", reason="the functions are compared in CasADi, of the extra [test]")
@@ -141,7 +141,7 @@ def test_what_casadi_cannot_take_is_refused(tmp_path):
             export_c({"f": (function, examples)}, tmp_path / "c", casadi=True, **keywords)
     assert not (tmp_path / "c").exists()
     with one_line(r"^casadi_m_f: it would take 4 KiB of stack; .* up to 2 KiB; export it without casadi$"):
-        external_c.external_functions("m", {"f": (jnp.tanh, [np.ones(500)])}, Source("f64", libm=True), stack=2048)
+        external_c.external_functions("m", {"f": (jnp.tanh, [np.ones(500)])}, Source("f64"), stack=2048)
 
 
 def test_what_casadi_cannot_take_is_left_out_where_it_may_be(tmp_path):

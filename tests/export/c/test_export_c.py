@@ -13,14 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
-from comparison import STRICT, needs_compiler
+from comparison import STRICT, files_of, needs_compiler
 from jax import lax
 from sanitized import SANITIZERS
 
 from dln_jax.export.c import interface
 from dln_jax.export.c.load import STANDARD, compile_c, load_c
-from dln_jax.export.c.source import export_c, source_files
-from dln_jax.export.exports import write_exports
+from dln_jax.export.c.source import export_c
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import save_tree
 
@@ -69,14 +68,14 @@ def exported(folder):
 
 
 def test_files_are_the_same_each_time_and_say_what_they_are():
-    once, again = (source_files(FUNCTIONS, name="arm", precision="f32") for _ in range(2))
+    once, again = (files_of(FUNCTIONS, name="arm", precision="f32") for _ in range(2))
     assert once == again
     assert {*once} == {"arm.h", "arm.c", "arm_demo.c", "arm.json", "CMakeLists.txt"}
     header, source = once["arm.h"].decode(), once["arm.c"].decode()
     assert f"C format {interface.FORMAT}" in header
     assert "void arm_step(const float x[4], const float u[1], float x_next[4]);" in header
     assert "float arm_energy(const float x[3], float k);" in header
-    assert "const int64_t i[2]" in source_files(FUNCTIONS, name="arm")["arm.h"].decode()
+    assert "const int64_t i[2]" in files_of(FUNCTIONS, name="arm")["arm.h"].decode()
     assert re.findall(r"#include (\S+)", source) == ["<float.h>", "<math.h>", "<stdint.h>", '"arm.h"']
     assert not re.search(r"\b(malloc|static (?!const|inline|void)|double)\b", source)
     stated = json.loads(once["arm.json"])["functions"]
@@ -98,7 +97,7 @@ def test_the_demo_is_clean_under_the_sanitizers(tmp_path):
 
 @needs_compiler
 def test_an_object_has_no_state_and_needs_libm_only(folder, tmp_path):
-    compile_c(["-O1", "-c", str(folder / "model.c"), "-o", str(tmp_path / "model.o")])
+    compile_c(["-O1", "-DDLN_OWN_ELEMENTARY", "-c", str(folder / "model.c"), "-o", str(tmp_path / "model.o")])
     nm = subprocess.run(["nm", tmp_path / "model.o"], capture_output=True, text=True, check=True).stdout
     sorts = {line.split()[-1]: line.split()[-2] for line in nm.splitlines()}
     # Text, and constants: no data that can change.
@@ -111,13 +110,14 @@ def test_an_object_has_no_state_and_needs_libm_only(folder, tmp_path):
 @needs_compiler
 @pytest.mark.skipif(not shutil.which("g++"), reason="there is no C++ compiler on the PATH")
 def test_the_source_is_cpp_too(folder):
-    compile_c(["-pedantic", *STRICT, "-fsyntax-only", "-x", "c++", str(folder / "model.c")], "g++")
+    compile_c(
+        ["-pedantic", *STRICT, "-DDLN_OWN_ELEMENTARY", "-fsyntax-only", "-x", "c++", str(folder / "model.c")], "g++"
+    )
 
 
 @needs_x86
-def test_the_library_may_have_its_own_elementary_functions_which_bear_extended_precision(tmp_path):
-    export_c({"network": FUNCTIONS["network"]}, tmp_path, libm=True)
-    assert "elementary_tanh" not in (tmp_path / "model.c").read_text()
+def test_functions_of_the_c_library_bear_extended_precision(tmp_path):
+    export_c({"network": FUNCTIONS["network"]}, tmp_path)
     x = np.linspace(-1, 1, 33)
     loaded = load_c(tmp_path, compiler="gcc", flags=("-O0", *STRICT, "-mfpmath=387"))
     np.testing.assert_allclose(loaded.network(x), np.tanh(x @ W), rtol=1e-12)
@@ -130,7 +130,7 @@ def test_cmake_builds_library_and_demo(tmp_path):
     # One folder per export: a second one would need a CMake file of its own.
     with pytest.raises(InputError, match=r"holds CMakeLists\.txt already"):
         export_c(FUNCTIONS, tmp_path, name="other")
-    for arguments in (["-S", ".", "-B", "build"], ["--build", "build"]):
+    for arguments in (["-S", ".", "-B", "build", "-DDLN_OWN_ELEMENTARY=ON"], ["--build", "build"]):
         subprocess.run(["cmake", *arguments], cwd=tmp_path, check=True, capture_output=True)
     assert "x_next" in subprocess.run([tmp_path / "build" / "swing_demo"], capture_output=True, text=True).stdout
 
@@ -149,7 +149,7 @@ def test_the_loader_says_what_is_missing(folder, tmp_path, monkeypatch):
         with pytest.raises(InputError, match=r"could not compile the model: .*error"):
             load_c(folder, flags=("--no-such-flag",))
     monkeypatch.setattr(interface, "FORMAT", 99)
-    with pytest.raises(InputError, match="C format 5; this release reads format 99"):
+    with pytest.raises(InputError, match="C format 6; this release reads format 99"):
         load_c(folder)
 
 
@@ -166,16 +166,14 @@ class Killed(BaseException):
 
 def test_a_kill_leaves_an_old_export_or_a_new_one_or_a_refusal(tmp_path, monkeypatch):
     """An export in place of an older one, killed before any of its renames."""
-    numbers = {"old": 2.0, "new": 3.0}
-    written = {
-        age: source_files({"f": (lambda x, k=k: k * x, (np.ones(2),))}, name="model") for age, k in numbers.items()
-    }
+    old, new = ({"f": (lambda x, k=k: k * x, (np.ones(2),))} for k in (2.0, 3.0))
+    before, after = files_of(old), files_of(new)
     replace = Path.replace
     monkeypatch.setattr(Path, "unlink", lambda self, **_: None)
-    total = len(written["new"])
+    total = len(after)
     for renamed in range(total + 1):
         folder, count = tmp_path / str(renamed), iter(range(total + 1))
-        write_exports(folder, written["old"], overwrite=False)
+        export_c(old, folder)
 
         def killed_before(self, target, count=count, renamed=renamed):
             if next(count) == renamed:
@@ -184,25 +182,24 @@ def test_a_kill_leaves_an_old_export_or_a_new_one_or_a_refusal(tmp_path, monkeyp
 
         with monkeypatch.context() as patch, contextlib.suppress(Killed):
             patch.setattr(Path, "replace", killed_before)
-            write_exports(folder, written["new"], overwrite=True)
+            export_c(new, folder, overwrite=True)
         assert next(count) == min(renamed + 1, total)
         try:
             source = interface.read_interface(folder, "model")[2]["model.c"]
         except InputError as error:
-            assert 0 < renamed < total and "truncated or altered" in str(error)
+            assert 0 < renamed < total and "is altered, renamed or of another export" in str(error)
         else:
-            # The source is the last file but one: before it is renamed, only the demo and CMake's file can be new.
-            assert source == written["new" if renamed == total else "old"]["model.c"]
+            assert source == (after if renamed == total else before)["model.c"]
 
 
 ALTERED = {
-    "source": ({"model.c": b"int x;"}, r"model\.c is truncated or altered"),
-    "header": ({"model.h": b""}, r"model\.h is truncated or altered"),
+    "source": ({"model.c": b"int x;"}, r"model\.c is altered"),
+    "header": ({"model.h": b""}, r"model\.c is altered"),
     "no source": ({"model.c": None}, r"model\.c: cannot be read"),
     "no description": ({"model.json": None}, "no such file"),
     "truncated": ({"model.json": b'{"format": 2,'}, "not readable as JSON"),
-    "older": ({"model.json": b'{"format": 1, "precision": "f64", "d": 1}'}, "C format 1; this release reads format 5"),
-    "files": ({"model.json": b'{"format": 5, "files": "model.c"}'}, "does not describe the files beside it"),
+    "older": ({"model.json": b'{"format": 1, "precision": "f64", "d": 1}'}, "C format 1; this release reads format 6"),
+    "format alone": ({"model.json": b'{"format": 6}'}, r"model\.c is altered"),
 }
 
 
@@ -216,52 +213,46 @@ def test_files_that_are_not_as_written_are_refused(exported, tmp_path):
             load_c(tmp_path / case)
 
 
-FACTS = {
-    "format": (7, [3]),
-    "name": ("arm", None),
-    "precision": ("f32", "f16", {}),
-    "functions": (None, 3, {"energy": {}}, {"energy; int x": {"arguments": [], "results": []}}),
-}
-LEAVES = (
-    *(["x", kind, [3]] for kind in ("int", None)),
-    *(["x", "real", shape] for shape in ([4], [-3], [True], [3.0], [10**9], None)),
-    *([name, "real", [3]] for name in ("y", "x;")),
+CHANGES = (
+    (b'"f64"', b'"f32"'),
+    (b'"name": "model"', b'"name": "arm"'),
+    (b'"operations": ', b'"operations": 1'),
+    (b'"energy"', b'"energy_2"'),
 )
 
 
-def test_no_field_of_a_description_is_believed(exported, tmp_path):
-    stated = json.loads(exported["model.json"])
-    facts = {key: value for key, value in stated.items() if key != "files"}
+def test_a_changed_description_is_refused(exported, tmp_path):
     for name, data in exported.items():
         (tmp_path / name).write_bytes(data)
-    cases = [(key, value) for key, values in FACTS.items() for value in values]
-    for changes in ({"operations": -1}, *({"arguments": [leaf, ["k", "real", []]]} for leaf in LEAVES)):
-        energy = {**facts["functions"]["energy"], **changes}
-        cases.append(("functions", {**facts["functions"], "energy": energy}))
-    for key, value in cases:
-        (tmp_path / "model.json").write_text(json.dumps({**stated, key: value}))
-        with one_line("does not describe the files beside it|C format"):
+    for there, changed in CHANGES:
+        assert there in exported["model.json"]
+        (tmp_path / "model.json").write_bytes(exported["model.json"].replace(there, changed, 1))
+        with one_line(r"model\.c is altered, renamed or of another export"):
             load_c(tmp_path)
+    for name, data in exported.items():
+        (tmp_path / name.replace("model", "arm")).write_bytes(data)
+    with one_line("is altered, renamed"):
+        load_c(tmp_path, name="arm")
     with pytest.raises(InputError, match="expected a C name"):
         load_c(tmp_path, name="../model")
 
 
 @needs_x86
 def test_flags_that_give_wrong_numbers_do_not_compile(folder):
-    for flag in ("-ffast-math", "-ffinite-math-only", "-mfpmath=387"):
+    for flag in ("-ffast-math", "-ffinite-math-only", "-mfpmath=387 -DDLN_OWN_ELEMENTARY"):
         with pytest.raises(InputError, match=r"#error .*(-ffast-math|-mfpmath=sse)"):
-            load_c(folder, compiler="gcc", flags=(flag,))
+            load_c(folder, compiler="gcc", flags=flag.split())
 
 
 def test_an_export_never_takes_the_place_of_a_runs_file(tmp_path):
     save_tree(tmp_path, "model", {"w": np.ones(2)}, {})
     before = contents(tmp_path)
-    for name in ("model.json", "config.json", "inverse.c"):
+    for name in ("model", "config"):
         with pytest.raises(InputError, match="is the folder of a run"):
-            write_exports(tmp_path, {name: b"{}"}, overwrite=True)
+            export_c(FUNCTIONS, tmp_path, name=name, overwrite=True)
     assert contents(tmp_path) == before
 
 
 def test_results_keep_the_order_in_which_they_were_written_and_a_shape_is_an_example():
-    files = source_files({"f": (lambda x: {"z": x[0], "a": x}, (jax.ShapeDtypeStruct((3,), float),))}, name="m")
+    files = files_of({"f": (lambda x: {"z": x[0], "a": x}, (jax.ShapeDtypeStruct((3,), float),))}, name="m")
     assert "void m_f(const double x[3], double z[1], double a[3]);" in files["m.h"].decode()

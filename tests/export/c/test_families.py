@@ -11,7 +11,7 @@ from calls import one_line
 from conftest import slow_among
 from jax import lax
 
-from dln_jax.export.c.families import functions_of_run, functions_of_system
+from dln_jax.export.functions import functions_of_run, functions_of_system
 from dln_jax.mechanics import integrators
 from dln_jax.mechanics.dynamics import Dynamics, InverseForward, PhaseRates
 from dln_jax.mechanics.equations import Canonical, dynamics, flow

@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from comparison import needs_compiler
+from comparison import files_of, needs_compiler
 
 from dln_jax.export.c import lowering
-from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import load_c
-from dln_jax.export.c.source import export_c, source_files
+from dln_jax.export.c.source import export_c
+from dln_jax.export.functions import functions_of_system
 from dln_jax.scenes.pendulums import chain
 
 
@@ -69,7 +69,7 @@ def test_what_is_called_counts_with_what_calls_it():
         "of_outer": lambda x: 2 * outer(outer(x)),
         "of_both": lambda x: outer(outer(x)) + inner(x),
     }
-    files = source_files({name: (call, (STATE,)) for name, call in callers.items()}, name="model")
+    files = files_of({name: (call, (STATE,)) for name, call in callers.items()})
     stated = json.loads(files["model.json"])["functions"].values()
     operations, stack = ([facts[key] for facts in stated] for key in ("operations", "stack_bytes"))
     inside = operations[0]
@@ -82,8 +82,8 @@ def test_what_is_left_out_leaves_nothing_behind():
     large = np.random.default_rng(0).normal(size=(200, 200))
     small = {"f": (lambda x: 2 * x, (STATE,))}
     both = {"large": (lambda x: jnp.linalg.solve(large * x, large), (np.ones(()),)), **small}
-    kept = source_files(both, name="model", leave_out_large=True)["model.c"]
-    assert kept == source_files(small, name="model")["model.c"]
+    kept = files_of(both, leave_out_large=True)["model.c"]
+    assert kept == files_of(small)["model.c"]
 
 
 def test_precisions_may_follow_each_other_in_a_process(tmp_path):
@@ -93,9 +93,9 @@ def test_precisions_may_follow_each_other_in_a_process(tmp_path):
     for turn, (precision, dtype) in enumerate(2 * [("f64", np.float64), ("f32", np.float32)]):
         functions = functions_of_system(scene.closed_form, 3, dtype=dtype)
         chosen = {"gravity_jacobian": functions["gravity_jacobian"]}
-        texts.append(source_files(chosen, name="model", precision=precision))
+        texts.append(files_of(chosen, precision=precision))
         np.testing.assert_array_equal(jax.jit(scene.gravity)(q), before, err_msg=str(turn))
     assert texts[:2] == texts[2:]
     with jax.enable_x64(False):
-        again = source_files(chosen, name="model", precision="f64")["model.c"]
+        again = files_of(chosen, precision="f64")["model.c"]
     assert again == texts[0]["model.c"]  # constants are not rounded

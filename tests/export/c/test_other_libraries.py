@@ -123,3 +123,23 @@ def test_an_error_is_nan(tmp_path):
     np.testing.assert_array_equal(numbers, [[1.0, 5.0], [np.nan, np.nan]])
     np.testing.assert_array_equal(whole, [[0, 1], [2**63 - 1, 2**63 - 1]])
     assert np.isnan(got["unsolved"][0]).all()
+
+
+BODY = '<body pos="0 0 -.3"><joint axis="{}" damping=".1"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".03"/>'
+ARM = f"<mujoco><worldbody>{''.join(map(BODY.format, ('0 1 0', '1 0 0', '0 1 0')))}{3 * '</body>'}</worldbody></mujoco>"
+
+
+def test_step_of_mjx(tmp_path):
+    mjx = pytest.importorskip("mujoco.mjx", reason="mjx is the package mujoco-mjx")
+    model = mjx.put_model(pytest.importorskip("mujoco").MjModel.from_xml_string(ARM))
+    data = mjx.make_data(model)
+
+    def step(q, qd, tau):
+        after = mjx.step(model, data.replace(qpos=q, qvel=qd, qfrc_applied=tau))
+        return after.qpos, after.qvel
+
+    states = {"step": [tuple(state) for state in RANDOM.normal(size=(20, 3, 3))]}
+    functions = {"step": (step, states["step"][0])}
+    ours, theirs = in_c(functions, states, tmp_path)["step"], in_jax(functions, states)["step"]
+    for got, expected in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-14 * np.abs(expected).max())

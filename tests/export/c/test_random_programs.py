@@ -11,12 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import random_programs
-from comparison import needs_compiler
+from comparison import files_of, needs_compiler
 from conftest import slow_among
 from sanitized import in_sanitized_c
 
 from dln_jax.export.c import lowering
-from dln_jax.export.c.source import source_files
 
 BATCHES = [range(2), range(2, 20), range(20, 40), range(40, 60)]
 """Seeds of programs that are compiled together; the slow tests have all but the first."""
@@ -78,7 +77,7 @@ print(digest(range(8)))
 
 def digest(seeds):
     """Returns the digest of the programs' C."""
-    return hashlib.sha256(source_files(programs_of(seeds)[0], name="model")["model.c"]).hexdigest()
+    return hashlib.sha256(files_of(programs_of(seeds)[0])["model.c"]).hexdigest()
 
 
 def test_the_text_is_the_same_in_every_process():

@@ -42,9 +42,9 @@ ON_THREE = {
         "'eigh' has C for all eigenvalues",
     ),
     "factors without elements": (lambda x: jnp.linalg.qr(x[:, None][:, :0], "complete"), r"shape \(3, 0\)"),
-    "same results": (lambda x: {"a": {"b": x}, "a_b": x}, "two results have one name"),
+    "same results": (lambda x: {"a": {"b": x}, "a_b": x}, "list of results names 'a_b' twice"),
     "branch of Python": (lambda x: x if x[0] > 0 else -x, "write jnp.where or lax.cond"),
-    "argument of the source": (lambda v3_: 2 * v3_, "name of an argument is 'v3_'"),
+    "argument of the source": (lambda v3_: 2 * v3_, "argument name is 'v3_'"),
 }
 FUNCTIONS = {
     **{case: (function, (X,), message) for case, (function, message) in ON_THREE.items()},
@@ -56,7 +56,7 @@ FUNCTIONS = {
     "source": (lambda x: x @ LARGE, (np.zeros(230),), r"source would take 1 MB; .* 1 MB"),
     "no array": (lambda x: x, ("text",), "(type|array)"),
     "no tuple": (lambda x: x, X, "one example for each argument"),
-    "same leaves": (lambda a, a_b: a["b"] + a_b, ({"b": 1.0}, 2.0), "two arguments have one name"),
+    "same leaves": (lambda a, a_b: a["b"] + a_b, ({"b": 1.0}, 2.0), "list of arguments names 'a_b' twice"),
 }
 
 

@@ -11,13 +11,13 @@ from comparison import needs_compiler, needs_gcc
 from conftest import slow_among
 from jax import lax
 
-from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.interface import stated_costs
-from dln_jax.export.c.load import STANDARD, load_c
+from dln_jax.export.c.load import FLAGS, STANDARD, load_c
 from dln_jax.export.c.source import export_c
+from dln_jax.export.functions import functions_of_system
 from dln_jax.scenes.pendulums import cart_pole, chain
 
-LEVELS = {False: (("-O1",), ("-Os",)), True: (("-O2",), ("-O3", "-march=native"))}
+LEVELS = {False: (("-O1",), ("-Os",)), True: (("-O2",), FLAGS)}
 """Flags of a compiler, by whether arguments are stated finite."""
 W = [np.random.default_rng(k).normal(size=shape) for k, shape in enumerate([(3, 40), (40, 40), (40, 10)])]
 

@@ -5,12 +5,12 @@ import json
 import jax
 import jax.numpy as jnp
 import numpy as np
-from comparison import in_c, in_jax, needs_compiler
+from comparison import files_of, in_c, in_jax, needs_compiler
 from jax import lax
 
-from dln_jax.export.c.families import functions_of_system
 from dln_jax.export.c.load import load_c
-from dln_jax.export.c.source import export_c, source_files
+from dln_jax.export.c.source import export_c
+from dln_jax.export.functions import functions_of_system
 from dln_jax.scenes.pendulums import pendulum
 
 BOUND = 1e-12
@@ -18,7 +18,7 @@ SPARSE = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 2.0], [-1.0, 0.0, 0.0, 
 
 
 def operations(function, *examples, finite=True):
-    stated = json.loads(source_files({"f": (function, examples)}, name="m", finite=finite)["m.json"])
+    stated = json.loads(files_of({"f": (function, examples)}, finite=finite)["model.json"])
     return stated["functions"]["f"]["operations"]
 
 
