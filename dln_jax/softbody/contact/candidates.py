@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 
 CLUSTER = 8
 """Number of primitives that share one bounding box."""
@@ -67,14 +69,16 @@ def boxes(of: Group, x: Float[Array, "n dim"], end: Float[Array, "n dim"], margi
     return Boxes(low.min(axis=1) - margin, high.max(axis=1) + margin)
 
 
-def meeting(one: Boxes, other: Boxes) -> Int[np.ndarray, "m 2"]:
-    """Returns the pairs of known boxes that meet, by rows of the first."""
+def meeting(one: tuple[ArrayLike, ArrayLike], other: tuple[ArrayLike, ArrayLike]) -> Int[np.ndarray, "m 2"]:
+    """Returns the pairs of known boxes (low, high) that meet, by rows of the first."""
     (low, high), (other_low, other_high) = (map(np.asarray, side) for side in (one, other))
-    rows = [
-        np.flatnonzero((bottom <= other_high).all(axis=1) & (other_low <= top).all(axis=1))
-        for bottom, top in zip(low, high, strict=True)
-    ]
-    return np.stack([np.repeat(np.arange(len(rows)), [len(row) for row in rows]), np.concatenate(rows)], axis=1)
+    # Boxes that meet have centres no farther apart than the halves of the longest sides, and rounding.
+    reach = (np.max(high - low) + np.max(other_high - other_low)) / 2 + 1e-12 * np.abs(other_high).max()
+    trees = KDTree((low + high) / 2), KDTree((other_low + other_high) / 2)
+    columns = trees[0].query_ball_tree(trees[1], reach, p=np.inf)
+    row, column = np.repeat(np.arange(len(low)), list(map(len, columns))), np.concatenate(columns).astype(int)
+    meet = (low[row] <= other_high[column]) & (other_low[column] <= high[row])
+    return np.stack([row, column], axis=1)[meet.all(axis=1)]
 
 
 def meetings(one: Group, other: Group, x: Float[np.ndarray, "n dim"], margin: float) -> tuple[int, int]:
