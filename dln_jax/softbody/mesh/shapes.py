@@ -122,6 +122,14 @@ def box_quadruped() -> Creature:
     return Creature("box-quadruped", mesh, np.array(pairs))
 
 
+def creature_named(name: str) -> Creature:
+    """Returns the creature of this name; `InputError` lists the names if it is unknown."""
+    creatures = {"crawler": crawler, "biped": biped, "quadruped": quadruped, "box-quadruped": box_quadruped}
+    if name not in creatures:
+        raise InputError(f"creature '{name}' is unknown; choose from {', '.join(creatures)}")
+    return creatures[name]()
+
+
 def body_length(creature: Creature) -> float:
     """Extent of the rest shape along x, in m."""
     return float(np.ptp(creature.mesh.vertices[:, 0]))

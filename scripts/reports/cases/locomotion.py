@@ -17,11 +17,9 @@ from gymnasium.wrappers import TransformReward
 
 from dln_jax.data.arrays import load_file
 from dln_jax.locomotion.environment import CreatureEnvironment
-from dln_jax.locomotion.frames import Frame
-from dln_jax.locomotion.gradient import shown_walk, train
-from dln_jax.locomotion.learning import GOAL, Goal, Parameters, Policy, Record, median_to_reach
-from dln_jax.locomotion.perturbed import STEPS, numbers_of, perturbed_trials
-from dln_jax.locomotion.task import POSITION_UNIT, LocomotionTask, make_task
+from dln_jax.locomotion.gradient import Parameters, Policy, shown_walk
+from dln_jax.locomotion.learning import GOAL, STEPS, Record, median_to_reach, numbers_of, perturbed_trials, train
+from dln_jax.locomotion.task import POSITION_UNIT, Frame, LocomotionTask, make_task
 from dln_jax.locomotion.worlds import FLAT, Variation
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import Creature, crawler
@@ -48,10 +46,10 @@ def measure_comparison(*, rivals: tuple[str, ...] = ("ppo",), seeds: int = 3, st
     """
     if unknown := set(rivals) - {"ppo"}:
         raise InputError(f"--rivals names {unknown.pop()!r:.40}; choose from ppo")
-    task, goal = make_task(crawler()), Goal(steps, UNTIL)
-    curves = {"gradient": [one.records for one in train(task, seeds=range(seeds), goal=goal).learned]}
+    task = make_task(crawler())
+    curves = {"gradient": [one.records for one in train(task, seeds=range(seeds), steps=steps, until=UNTIL)]}
     if rivals:
-        curves["ppo"] = [learn_by_ppo(task, seed, goal) for seed in range(seeds)]
+        curves["ppo"] = [learn_by_ppo(task, seed, steps) for seed in range(seeds)]
     numbers: dict[str, dict[str, float]] = {}
     needed = {}
     for method, records in curves.items():
@@ -68,7 +66,7 @@ def measure_comparison(*, rivals: tuple[str, ...] = ("ppo",), seeds: int = 3, st
     return numbers
 
 
-def learn_by_ppo(task: LocomotionTask, seed: int, goal: Goal, *, lanes: int = 16, rollout: int = 80) -> list[Record]:
+def learn_by_ppo(task: LocomotionTask, seed: int, steps: int, *, lanes: int = 16, rollout: int = 80) -> list[Record]:
     """Proximal policy optimisation (Schulman et al. 2017) by stable-baselines3; evaluates after every update."""
     try:
         import torch  # pyright: ignore[reportMissingImports]
@@ -90,7 +88,7 @@ def learn_by_ppo(task: LocomotionTask, seed: int, goal: Goal, *, lanes: int = 16
         policy_kwargs={"net_arch": [64, 64], "log_std_init": math.log(0.6)},
     )  # fmt: skip
     records: list[Record] = []
-    while model.num_timesteps < goal.steps and not (records and records[-1].distance >= goal.distance):
+    while model.num_timesteps < steps and not (records and records[-1].distance >= UNTIL):
         model.learn(lanes * rollout, reset_num_timesteps=not records)
         seen, _ = one.reset()
         last, ended = 0.0, False
