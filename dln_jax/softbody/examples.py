@@ -32,7 +32,7 @@ from dln_jax.softbody.scene import SoftScene, make_scene
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.creature import MASS, TIME_STEP, Bumps, creature_terms
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.strain_energies import StrainEnergy, stable_neo_hookean
 from dln_jax.softbody.terms.term import Numbers, Term
 from dln_jax.types import InputError

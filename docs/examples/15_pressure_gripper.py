@@ -36,8 +36,7 @@ from dln_jax.softbody.mesh.shapes import disc, lattice
 from dln_jax.softbody.mesh.surfaces import enclosed_volume, inner_surface, surface_parts
 from dln_jax.softbody.scene import make_scene, potential
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
-from dln_jax.softbody.terms.pressure import pressure
+from dln_jax.softbody.terms.loads import gravity, pressure
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 
 jax.config.update("jax_enable_x64", True)

@@ -39,7 +39,7 @@ from dln_jax.softbody.mesh.placement import translate
 from dln_jax.softbody.mesh.shapes import Creature, lattice
 from dln_jax.softbody.scene import make_scene
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.springs import muscles
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 

@@ -25,12 +25,9 @@ from dln_jax.softbody.scene import make_scene, potential, with_parameters
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.fibres import fibres
-from dln_jax.softbody.terms.gravity import gravity
-from dln_jax.softbody.terms.loads import body_force, point_force, traction
-from dln_jax.softbody.terms.pressure import gas, pressure
-from dln_jax.softbody.terms.springs import muscles
+from dln_jax.softbody.terms.loads import body_force, gas, gravity, point_force, pressure, traction
+from dln_jax.softbody.terms.springs import muscles, path_length, tendon_of_length, tendon_of_tension
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
-from dln_jax.softbody.terms.tendons import path_length, tendon_of_length, tendon_of_tension
 
 E, NU = 1e5, 0.3
 

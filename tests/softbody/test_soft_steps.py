@@ -24,7 +24,7 @@ from dln_jax.softbody.scene import make_scene, with_parameters
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.fibres import fibres
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.springs import springs
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 

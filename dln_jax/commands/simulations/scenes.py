@@ -21,8 +21,7 @@ from dln_jax.softbody.mesh.mesh import Mesh, components, overlaps
 from dln_jax.softbody.mesh.sets import values_by_set, vertices_in
 from dln_jax.softbody.mesh.surfaces import facet_points, facets_in, inner_surface
 from dln_jax.softbody.step import Stepper
-from dln_jax.softbody.terms.loads import point_force, traction
-from dln_jax.softbody.terms.pressure import pressure
+from dln_jax.softbody.terms.loads import point_force, pressure, traction
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.softbody.terms.term import Term
 from dln_jax.types import InputError, require_positive

@@ -19,7 +19,7 @@ from dln_jax.softbody.mesh.mesh import Mesh, indices_of
 from dln_jax.softbody.terms.elasticity import quadratic_geometry, rest_geometry, shape_gradients
 from dln_jax.softbody.terms.springs import length_of
 from dln_jax.softbody.terms.strain_energies import DeformationGradient
-from dln_jax.softbody.terms.term import NOT_NEGATIVE, Context, Corners, Numbers, Term, control_of, material
+from dln_jax.softbody.terms.term import NOT_NEGATIVE, Context, Corners, Numbers, Term, material, value_or_control
 from dln_jax.solvers.elements.energies import combinations
 from dln_jax.types import InputError, Scalar
 
@@ -83,9 +83,8 @@ def fibres(
     nodes = mesh.nodes[chosen]
 
     def prepare(parameters: Fibres, context: Context) -> tuple[Any, ...]:
-        activation = parameters.activation
-        if activation is None:
-            activation = control_of(name, context, (number,), "the activation of every group of fibres, from 0 to 1")
+        meaning = "the activation of every group of fibres, from 0 to 1"
+        activation = value_or_control(parameters.activation, name, context, (number,), meaning)
         geometry = jax.vmap(rest_geometry if mesh.midsides is None else quadratic_geometry)(context.rest[nodes])
         direction = jnp.broadcast_to(parameters.direction, (count, mesh.dimension))
         unit = direction / jnp.linalg.norm(direction, axis=1, keepdims=True)

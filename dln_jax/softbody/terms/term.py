@@ -107,8 +107,16 @@ def material(
     return result
 
 
-def control_of(name: str, context: Context, shape: tuple[int, ...], meaning: str) -> Float[Array, "..."]:
-    """Returns the control of a driven term (a number as [] or [1]); if it is missing, `InputError` explains it."""
+def value_or_control(
+    value: Any, name: str, context: Context, shape: tuple[int, ...], meaning: str
+) -> Float[Array, "..."]:
+    """Returns a parameter, or in place of `None` the control of the term (a number as [] or [1]).
+
+    Raises:
+        InputError: the control is missing or has another shape; the message explains it.
+    """
+    if value is not None:
+        return value
     control = context.control
     if control is None or (jnp.shape(control) != shape and not jnp.size(control) == math.prod(shape) == 1):
         got = "no control" if control is None else f"a control of shape {jnp.shape(control)}"

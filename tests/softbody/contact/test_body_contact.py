@@ -21,7 +21,7 @@ from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.scene import make_scene, prepare_contacts
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.elements.moving import lists_between, moving_gradient
 

@@ -17,7 +17,7 @@ from dln_jax.softbody.scene import contact_energies, make_scene, potential, prep
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.contact import motion_of, plane_contact
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.elements.moving import lists_between, moving_gradient
 
