@@ -18,14 +18,13 @@ Take = Callable[[str, Any], np.ndarray]
 """(type, count) -> the next numbers of a section."""
 
 KINDS = {
-    **{1: ("line", 2), 2: ("triangle", 3), 3: ("quad", 4), 4: ("tetra", 4), 5: ("hexahedron", 8), 6: ("wedge", 6)},
-    **{7: ("pyramid", 5), 8: ("line3", 3), 9: ("triangle6", 6), 10: ("quad9", 9), 11: ("tetra10", 10)},
-    **{12: ("hexahedron27", 27), 13: ("wedge18", 18), 14: ("pyramid14", 14), 15: ("vertex", 1), 16: ("quad8", 8)},
-    **{17: ("hexahedron20", 20), 18: ("wedge15", 15), 19: ("pyramid13", 13), 21: ("triangle10", 10)},
-    **{23: ("triangle15", 15), 25: ("triangle21", 21), 26: ("line4", 4), 27: ("line5", 5), 28: ("line6", 6)},
-    **{29: ("tetra20", 20), 30: ("tetra35", 35), 31: ("tetra56", 56), 36: ("quad16", 16), 37: ("quad25", 25)},
+    **{1: "line2", 2: "triangle3", 3: "quad4", 4: "tetra4", 5: "hexahedron8", 6: "wedge6", 7: "pyramid5", 8: "line3"},
+    **{9: "triangle6", 10: "quad9", 11: "tetra10", 12: "hexahedron27", 13: "wedge18", 14: "pyramid14", 15: "vertex1"},
+    **{16: "quad8", 17: "hexahedron20", 18: "wedge15", 19: "pyramid13", 21: "triangle10", 23: "triangle15"},
+    **{25: "triangle21", 26: "line4", 27: "line5", 28: "line6", 29: "tetra20", 30: "tetra35", 31: "tetra56"},
+    **{36: "quad16", 37: "quad25"},
 }
-"""Kind of cell and number of nodes by Gmsh's number; corners come first in all of them."""
+"""Kind of cell by Gmsh's number, and number of its nodes at the end; corners come first in all of them."""
 GEOMETRY = ("point", "curve", "surface", "volume")
 """Physical groups without a name get these names and their number, such as surface-3."""
 
@@ -90,7 +89,7 @@ def _gathered(tags: np.ndarray, points: np.ndarray, blocks: list[_Block], names:
         place = np.searchsorted(tags[order], nodes).clip(max=len(tags) - 1)
         if len(unknown := np.argwhere(tags[order][place] != nodes)):
             raise InputError(
-                f"{kind} {unknown[0][0]} has node {nodes[tuple(unknown[0])]}, which the file does not list"
+                f"{base(kind)} {unknown[0][0]} has node {nodes[tuple(unknown[0])]}, which the file does not list"
             )
         cells[kind], start = order[place], 0
         for block in own:
@@ -216,9 +215,10 @@ def _elements_2(
 
 
 def _kind(number: Any) -> tuple[str, int]:
+    """Returns the kind of cell with this number of Gmsh, and the number of its nodes."""
     if (kind := KINDS.get(int(number))) is None:
         raise InputError(f"it has elements of Gmsh's type {number}; expected linear triangles or tetrahedra")
-    return kind
+    return kind, int(kind.removeprefix(base(kind)))
 
 
 def _name(names: dict[tuple[int, int], str], dimension: int, tag: int) -> str:

@@ -82,7 +82,7 @@ def solid_mesh(content: FileMesh, *, scale: float = 1.0, merge: float = MERGE) -
     for kind, nodes in content.cells.items():
         if len(bad := np.argwhere((nodes < 0) | (nodes >= len(points)))):
             vertex = nodes[tuple(bad[0])]
-            raise InputError(f"{kind} {bad[0][0]} has vertex {vertex}; expected 0 to {len(points) - 1}")
+            raise InputError(f"{base(kind)} {bad[0][0]} has vertex {vertex}; expected 0 to {len(points) - 1}")
     if dimension == 2:
         points = _in_plane(points, np.concatenate([nodes.ravel() for nodes in of_dimension[2].values()]))
     for kind, nodes in of_dimension[dimension].items():
@@ -119,10 +119,11 @@ def _corners(
     sets: dict[str, dict[str, np.ndarray]] = {name: {} for name in content.cell_sets}
     curved = 0
     for kind, nodes in content.cells.items():
-        first, corners = base(kind), nodes[:, : CORNERS.get(base(kind))]
+        first = base(kind)
+        corners = nodes[:, : CORNERS.get(first)]
         start = len(cells.get(first, ()))
         cells[first] = np.concatenate([cells[first], corners]) if start else corners
-        curved += len(nodes) * (kind != first == element)
+        curved += len(nodes) * (first == element and nodes.shape != corners.shape)
         for name, members in content.cell_sets.items():
             if kind in members:
                 before = sets[name].get(first, np.zeros(0, np.int64))

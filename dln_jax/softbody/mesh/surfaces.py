@@ -191,41 +191,34 @@ def _open_ridges(facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "g d"]:
 def _oriented(mesh: Mesh, facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "f dim"]:
     """Turns facets of the boundary to point into the body, and others like their neighbours."""
     outside = {frozenset(facet): facet for facet in boundary(mesh).tolist()}
-    ridges, _ = _ridges(facets)
+    inward = [outside.get(frozenset(facet), [])[::-1] for facet in facets.tolist()]
     owners: dict[tuple, list[int]] = {}
-    for facet, of_facet in enumerate(ridges.tolist()):
-        for ridge in of_facet:
+    for facet, ridges in enumerate(_ridges(facets)[0].tolist()):
+        for ridge in ridges:
             owners.setdefault(tuple(ridge), []).append(facet)
-    turned: dict[int, list[int]] = {}
-    for number, facet in enumerate(facets.tolist()):
-        if (known := outside.get(frozenset(facet))) is not None:
-            turned[number] = known[::-1]
-    _spread(turned, list(turned), facets, owners)
-    for number in range(len(facets)):
-        if number not in turned:
-            turned[number] = facets[number].tolist()
-            part = _spread(turned, [number], facets, owners)
-            if enclosed_volume(mesh.vertices, np.array([turned[i] for i in part])) < 0:
-                for i in part:
-                    turned[i] = turned[i][::-1]
+    turned = {facet: known for facet, known in enumerate(inward) if known}
+    for start in sorted(range(len(facets)), key=lambda facet: not inward[facet]):
+        if start in turned and not inward[start]:
+            continue
+        turned.setdefault(start, facets[start].tolist())
+        part = [start]
+        for facet in part:  # which grows by its neighbours
+            for ridge, sign in _passages(turned[facet]):
+                both = owners[ridge]
+                for other in both if len(both) == 2 else ():
+                    if other not in turned:
+                        same = (ridge, -sign) in _passages(facets[other])
+                        turned[other] = facets[other].tolist()[:: 1 if same else -1]
+                        part.append(other)
+        if not inward[start] and enclosed_volume(mesh.vertices, np.array([turned[i] for i in part])) < 0:
+            turned |= {i: turned[i][::-1] for i in part}
     return np.array([turned[number] for number in range(len(facets))])
 
 
-def _spread(turned: dict[int, list[int]], front: list[int], facets: np.ndarray, owners: dict) -> list[int]:
-    """Turns neighbours like these facets, and theirs in turn; returns the given facets and all that were turned."""
-    reached = list(front)
-    while front:
-        facet = front.pop()
-        for ridge, sign in zip(*(part[0].tolist() for part in _ridges(np.array([turned[facet]]))), strict=True):
-            both = owners[tuple(ridge)]
-            for other in both if len(both) == 2 else ():
-                if other not in turned:
-                    candidate = facets[other].tolist()
-                    passed, signs = (part[0].tolist() for part in _ridges(np.array([candidate])))
-                    turned[other] = candidate if signs[passed.index(ridge)] == -sign else candidate[::-1]
-                    front.append(other)
-                    reached.append(other)
-    return reached
+def _passages(facet: Any) -> list[tuple[tuple[int, ...], int]]:
+    """Returns the ridges of one facet, each with its direction."""
+    ridges, signs = _ridges(np.array([facet]))
+    return [(tuple(ridge), sign) for ridge, sign in zip(ridges[0].tolist(), signs[0].tolist(), strict=True)]
 
 
 def _caps(facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "c dim"]:
