@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from dln_jax.softbody.contact.barrier import Contact
 from dln_jax.softbody.contact.bodies import body_contact
-from dln_jax.softbody.contact.contact import Contact
 from dln_jax.softbody.driven import Example
 from dln_jax.softbody.mesh.mesh import Mesh, boundary, lumped_masses, vertices_where
 from dln_jax.softbody.mesh.quadratic import quadratic, with_midsides

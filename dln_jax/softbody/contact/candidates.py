@@ -1,10 +1,15 @@
-"""Broad phase: lists, of fixed capacity, of primitives that may come near each other.
+"""The contact surface of a body, and lists, of fixed capacity, of its primitives that may come near each other.
+
+The facets of a quadratic mesh are divided at their mid-side nodes, into 2 edges in the plane and 4 triangles in space,
+so all nodes are in contact, on a surface that is linear between them.
 
 Primitives are grouped once into clusters of neighbours in the rest shape, which stay neighbours while the body deforms.
 The bounding boxes of clusters are compared first, then those of the primitives in clusters that meet. A list that is
 too short is reported, never silently cut off.
 """
 
+import functools
+import itertools
 from typing import NamedTuple
 
 import jax
@@ -14,8 +19,28 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
+from dln_jax.softbody.mesh.mesh import Mesh, boundary
+from dln_jax.softbody.mesh.surfaces import facet_nodes
+
 CLUSTER = 8
 """Number of primitives that share one bounding box."""
+Boxes = tuple[Float[Array, "*m dim"], Float[Array, "*m dim"]]
+"""Lowest and highest corners of bounding boxes, in m."""
+_PARTS = {3: ((0, 2), (2, 1)), 6: ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))}
+"""Parts of a quadratic facet by its number of nodes, with the facet's orientation."""
+
+
+class Surface(NamedTuple):
+    """Primitives of the boundary, as vertex indices. A body in the plane has no triangles."""
+
+    vertices: Int[np.ndarray, " v"]
+    edges: Int[np.ndarray, "e 2"]
+    triangles: Int[np.ndarray, "f 3"]
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return 3 if len(self.triangles) else 2
 
 
 class Group(NamedTuple):
@@ -27,22 +52,43 @@ class Group(NamedTuple):
     """Indices of the primitives in every cluster; -1 for an empty slot."""
 
 
-class Boxes(NamedTuple):
-    """Bounding boxes in m."""
+def surface_of(mesh: Mesh) -> Surface:
+    """Returns the boundary of a mesh."""
+    facets = boundary(mesh)
+    if mesh.midsides is not None:
+        nodes = facet_nodes(mesh, facets)
+        facets = nodes[:, np.array(_PARTS[nodes.shape[1]])].reshape(-1, mesh.dimension)
+    if mesh.dimension == 2:
+        return Surface(np.unique(facets), np.sort(facets, axis=1), np.zeros((0, 3), int))
+    pairs = facets[:, list(itertools.combinations(range(3), 2))].reshape(-1, 2)
+    return Surface(np.unique(facets), np.unique(np.sort(pairs, axis=1), axis=0), facets)
 
-    low: Float[Array, "*m dim"]
-    high: Float[Array, "*m dim"]
+
+def areas(surface: Surface, rest: Float[Array, "n dim"]) -> tuple[Float[Array, " v"], Float[Array, " e"]]:
+    """Returns the areas of vertices and edges in m²: each gets a third of the areas of its triangles.
+
+    In the plane, for a thickness of 1 m, a vertex gets half the lengths of its edges and an edge its length.
+    """
+    if surface.dimension == 2:
+        lengths = jnp.linalg.norm(rest[surface.edges[:, 1]] - rest[surface.edges[:, 0]], axis=1)
+        return _shared(surface.vertices[:, None], surface.edges, lengths / 2), lengths
+    a, b, c = (rest[corner] for corner in surface.triangles.T)
+    thirds = jnp.linalg.norm(jnp.cross(b - a, c - a), axis=1) / 6
+    return (
+        _shared(surface.vertices[:, None], surface.triangles, thirds),
+        _shared(surface.edges, surface.triangles, thirds),
+    )
 
 
-class PairList(NamedTuple):
-    """A list of pairs of primitives."""
-
-    pairs: Int[Array, "capacity 2"]
-    """Indices of the primitives."""
-    used: Bool[Array, " capacity"]
-    """False for unused slots."""
-    overflow: Bool[Array, ""]
-    """Whether there are more pairs than slots."""
+def _shared(primitives: np.ndarray, facets: np.ndarray, share: Float[Array, " facets"]) -> Float[Array, " primitives"]:
+    """Adds up, for every primitive, the shares of the facets that contain it."""
+    k = primitives.shape[1]
+    parts = np.sort(facets[:, list(itertools.combinations(range(facets.shape[1]), k))], axis=2)
+    _, number = np.unique(np.concatenate([primitives, parts.reshape(-1, k)]), axis=0, return_inverse=True)
+    order = np.zeros(len(primitives), int)
+    order[number.reshape(-1)[: len(primitives)]] = np.arange(len(primitives))
+    owners = order[number.reshape(-1)[len(primitives) :]]
+    return jnp.zeros(len(primitives), share.dtype).at[owners].add(jnp.repeat(share, parts.shape[1]))
 
 
 def group(primitives: Int[np.ndarray, "m k"], rest: Float[np.ndarray, "n dim"]) -> Group:
@@ -66,7 +112,7 @@ def group(primitives: Int[np.ndarray, "m k"], rest: Float[np.ndarray, "n dim"]) 
 def boxes(of: Group, x: Float[Array, "n dim"], end: Float[Array, "n dim"], margin: Array | float) -> Boxes:
     """Returns the boxes that primitives sweep from x to `end`, enlarged by a margin in m."""
     low, high = jnp.minimum(x, end)[of.primitives], jnp.maximum(x, end)[of.primitives]
-    return Boxes(low.min(axis=1) - margin, high.max(axis=1) + margin)
+    return low.min(axis=1) - margin, high.max(axis=1) + margin
 
 
 def meeting(one: tuple[ArrayLike, ArrayLike], other: tuple[ArrayLike, ArrayLike]) -> Int[np.ndarray, "m 2"]:
@@ -88,8 +134,10 @@ def meetings(one: Group, other: Group, x: Float[np.ndarray, "n dim"], margin: fl
     return len(meeting(_of_clusters(one, first), _of_clusters(other, second))), len(meeting(first, second))
 
 
-def pairs_near(one: Group, other: Group, of_one: Boxes, of_other: Boxes, capacity: tuple[int, int]) -> PairList:
-    """Returns the pairs of primitives without a common vertex whose boxes meet.
+def pairs_near(
+    one: Group, other: Group, of_one: Boxes, of_other: Boxes, capacity: tuple[int, int]
+) -> tuple[Int[Array, "capacity 2"], Bool[Array, " capacity"], Bool[Array, ""]]:
+    """Returns the pairs of primitives without a common vertex whose boxes meet, which slots are used, and overflow.
 
     Args:
         one, other: the primitives; pairs within one group are listed once.
@@ -109,30 +157,25 @@ def pairs_near(one: Group, other: Group, of_one: Boxes, of_other: Boxes, capacit
         present &= (row != column)[:, None, None] | (first[:, :, None] < second[:, None, :])
     corners, others = jnp.asarray(one.primitives)[first], jnp.asarray(other.primitives)[second]
     shared = (corners[:, :, None, :, None] == others[:, None, :, None, :]).any(axis=(3, 4))
-    near = _meet(*(Boxes(*(side[number] for side in box)) for box, number in ((of_one, first), (of_other, second))))
+    near = _meet((of_one[0][first], of_one[1][first]), (of_other[0][second], of_other[1][second]))
     place, taken, too_many = places(near & present & ~shared, capacity[1])
     cluster, i, j = jnp.unravel_index(place, near.shape)
-    return PairList(jnp.stack([first[cluster, i], second[cluster, j]], axis=1), taken, too_many | too_many_clusters)
+    return jnp.stack([first[cluster, i], second[cluster, j]], axis=1), taken, too_many | too_many_clusters
 
 
 def _of_clusters(of: Group, box: Boxes) -> Boxes:
     members, empty = jnp.asarray(of.clusters), (of.clusters < 0)[:, :, None]
-    low = jnp.where(empty, jnp.inf, box.low[members]).min(axis=1)
-    return Boxes(low, jnp.where(empty, -jnp.inf, box.high[members]).max(axis=1))
+    low = jnp.where(empty, jnp.inf, box[0][members]).min(axis=1)
+    return low, jnp.where(empty, -jnp.inf, box[1][members]).max(axis=1)
 
 
 def _meet(one: Boxes, other: Boxes) -> Bool[Array, "*batch one other"]:
     """Whether boxes meet, for all pairs along their last batch axis."""
-
-    def axis(i: int) -> Array:
-        return (one.low[..., :, None, i] <= other.high[..., None, :, i]) & (
-            other.low[..., None, :, i] <= one.high[..., :, None, i]
-        )
-
-    meets = axis(0)
-    for i in range(1, one.low.shape[-1]):
-        meets &= axis(i)
-    return meets
+    (low, high), (other_low, other_high) = one, other
+    axes = range(low.shape[-1])
+    before = [low[..., :, None, i] <= other_high[..., None, :, i] for i in axes]
+    after = [other_low[..., None, :, i] <= high[..., :, None, i] for i in axes]
+    return functools.reduce(jnp.logical_and, before + after)
 
 
 def places(mask: Bool[Array, "..."], capacity: int) -> tuple[Int[Array, " capacity"], Bool[Array, " capacity"], Array]:

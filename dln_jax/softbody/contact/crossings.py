@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dln_jax.softbody.contact.candidates import meeting
-from dln_jax.softbody.contact.surface import surface_of
+from dln_jax.softbody.contact.candidates import meeting, surface_of
 from dln_jax.softbody.mesh.mesh import Mesh, components_of_vertices
 
 _ROUNDING = 1e-14

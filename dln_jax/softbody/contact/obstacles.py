@@ -18,12 +18,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dln_jax.softbody.contact.barrier import barrier
-from dln_jax.softbody.contact.contact import Contact, ContactParameters, contact_parameters
-from dln_jax.softbody.contact.continuous_collision import longest_step
-from dln_jax.softbody.contact.surface import areas, surface_of
+from dln_jax.softbody.contact.barrier import SLIDING, Contact, ContactParameters, barrier, contact_parameters
+from dln_jax.softbody.contact.candidates import areas, surface_of
+from dln_jax.softbody.contact.distances import longest_step
 from dln_jax.softbody.mesh.mesh import Mesh
-from dln_jax.softbody.terms.contact import Slip, friction_energy, motion_of, plane_pose, slip_of
+from dln_jax.softbody.terms.contact import motion_of, plane_pose, slip_of
 from dln_jax.softbody.terms.term import Context, Numbers, Pose, vector
 from dln_jax.solvers.elements.moving import Elements, MovingEnergy
 from dln_jax.types import InputError, require_positive
@@ -232,14 +231,8 @@ def obstacle_contact(
 
         return longest_step(at, jnp.linalg.norm(step[surface.vertices], axis=1))
 
-    def slide(x: Float[Array, "1 dim"], slip: Slip) -> Float[Array, ""]:
-        return friction_energy(x[0], slip)
-
-    def energies_of(function: Callable[..., Array], describe: Callable[..., Any], longest: Any) -> MovingEnergy:
-        def hessian(x: Array, data: Any) -> Array:
-            return jax.hessian(function)(x, data).reshape(x.size, x.size)
-
-        return MovingEnergy(lambda *_: every, describe, jax.value_and_grad(function), hessian, longest)
+    def hessian(x: Array, data: Any) -> Array:
+        return jax.hessian(energy)(x, data).reshape(x.size, x.size)
 
     def prepare(parameters: ObstacleParameters, context: Context) -> tuple[Any, ...]:
         data = (parameters, context.rest)
@@ -252,16 +245,16 @@ def obstacle_contact(
         force = -2 * d * strength * barrier(d**2, near)[1] * steep
         carried = x + motion_of(name, parameters, context.before, x)
         largest = parameters.contact.friction * force
-        return data, slip_of(context, threshold_speed, carried, slope / steep[:, None], largest)
+        slip = slip_of(context, threshold_speed, carried, slope / steep[:, None], largest)
+        return data, (every, (slip, jnp.ones((len(x), 1), x.dtype)))
 
-    energies = [energies_of(energy, describe, longest)]
-    if friction is not None:
-        energies.append(energies_of(slide, lambda x, _, slip: slip, lambda x, *_: jnp.ones((), x.dtype)))
+    pushing = MovingEnergy(lambda *_: every, describe, jax.value_and_grad(energy), hessian, longest)
 
     def least_distance(x: Array, elements: Elements, data: tuple[ObstacleParameters, Array]) -> Array:
         return jnp.minimum(jnp.min(distances(x[surface.vertices], data[0].shape)), data[0].contact.distance)
 
-    return Contact(name, parameters, tuple(energies), prepare, least_distance, mesh, changing=False)
+    energies = (pushing,) if friction is None else (pushing, SLIDING)
+    return Contact(name, parameters, energies, prepare, least_distance, mesh, changing=False)
 
 
 def _spline(values: Float[Array, "*outer k"], at: Float[Array, ""]) -> Float[Array, "*outer"]:

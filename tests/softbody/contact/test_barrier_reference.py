@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dln_jax.softbody.contact.bodies import body_contact
-from dln_jax.softbody.contact.surface import surface_of
+from dln_jax.softbody.contact.candidates import surface_of
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.terms.term import Context

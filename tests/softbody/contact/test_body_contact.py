@@ -10,9 +10,9 @@ from scipy.optimize import linprog
 
 from dln_jax.softbody.contact.barrier import normal_force
 from dln_jax.softbody.contact.bodies import body_contact
+from dln_jax.softbody.contact.candidates import areas, surface_of
 from dln_jax.softbody.contact.crossings import _segments_meet_triangles, count_overlaps, crossings
 from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
-from dln_jax.softbody.contact.surface import areas, surface_of
 from dln_jax.softbody.integrators import AVERAGE_VECTOR_FIELD, MIDPOINT
 from dln_jax.softbody.mesh.mesh import Mesh, vertices_where
 from dln_jax.softbody.mesh.placement import join, translate
