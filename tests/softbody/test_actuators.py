@@ -10,8 +10,8 @@ from jax.flatten_util import ravel_pytree
 from scipy.optimize import fsolve
 
 from dln_jax.softbody.equilibrium import static_solve
+from dln_jax.softbody.mesh.changes import quadratic
 from dln_jax.softbody.mesh.mesh import NamedSet, boundary, make_mesh, volumes
-from dln_jax.softbody.mesh.quadratic import quadratic
 from dln_jax.softbody.mesh.shapes import beam, box, lattice
 from dln_jax.softbody.mesh.surfaces import (
     closed_surface,

@@ -14,8 +14,16 @@ from hypothesis import strategies as st
 
 from dln_jax.commands import simulate
 from dln_jax.softbody.mesh.files import read_mesh, write_mesh, write_motion
-from dln_jax.softbody.mesh.mesh import Mesh, NamedSet, boundary, components, make_mesh, volumes
-from dln_jax.softbody.mesh.sets import values_by_set, vertices_in
+from dln_jax.softbody.mesh.mesh import (
+    Mesh,
+    NamedSet,
+    boundary,
+    components,
+    make_mesh,
+    values_by_set,
+    vertices_in,
+    volumes,
+)
 from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.mesh.solids import FileMesh, solid_mesh
 from dln_jax.types import InputError

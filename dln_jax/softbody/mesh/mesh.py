@@ -5,7 +5,7 @@ Meshes are static NumPy arrays in float64, which become constants of the compile
 """
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -72,10 +72,7 @@ def make_mesh(vertices: ArrayLike, elements: ArrayLike) -> Mesh:
     """
     positions = _as_vertices(vertices)
     corners = _as_elements(elements, positions.shape[1])
-    _require_indices(positions, corners)
-    shape = regularity(positions, corners)
-    _require_volumes(positions, corners, shape)
-    inverted = shape < 0
+    inverted = _require_elements(positions, corners) < 0
     turned = np.where(inverted[:, None], corners[:, [*range(corners.shape[1] - 2), -1, -2]], corners)
     return Mesh(positions, turned.astype(np.int32), int(inverted.sum()))
 
@@ -164,6 +161,45 @@ def vertices_where(mesh: Mesh, condition: Callable[[Float[np.ndarray, "n dim"]],
     return np.flatnonzero(chosen)
 
 
+def vertices_in(mesh: Mesh, names: Iterable[str]) -> Int[np.ndarray, " k"]:
+    """Returns the vertices that are in any of these sets, in ascending order, for example for `held`.
+
+    Raises:
+        InputError: a set does not exist (the message lists those that do), or has no vertices.
+    """
+    members = [np.zeros(0, np.int64)]
+    for name in names:
+        if not len(vertices := _named(mesh, name).vertices):
+            raise InputError(
+                f"no vertex of the body is in the set '{name}' (MSH 2.2 with SaveAll keeps only names; use 4.1)"
+            )
+        members.append(vertices)
+    return np.unique(np.concatenate(members))
+
+
+def values_by_set(mesh: Mesh, default: float, values: Mapping[str, float]) -> Float[np.ndarray, " m"]:
+    """Returns one value per element, such as Young's modulus: that of its set, or the default outside these sets.
+
+    An element in several of these sets gets the value of the last one.
+
+    Raises:
+        InputError: a set does not exist, or has no elements.
+    """
+    result = np.full(len(mesh.elements), float(default))
+    for name, value in values.items():
+        if not len(elements := _named(mesh, name).elements):
+            raise InputError(f"the set '{name}' has no elements; expected a set of {WORDS[mesh.dimension][0]} elements")
+        result[elements] = value
+    return result
+
+
+def _named(mesh: Mesh, name: str) -> NamedSet:
+    if name not in mesh.sets:
+        known = f"the sets are {', '.join(sorted(mesh.sets))}" if mesh.sets else "it has no named sets"
+        raise InputError(f"the mesh has no set '{name}'; {known}")
+    return mesh.sets[name]
+
+
 def lumped_masses(mesh: Mesh, density: int | float | ArrayLike) -> Float[np.ndarray, " n"]:
     """Returns the masses of the vertices in kg: an element's corners get equal shares of its mass.
 
@@ -231,29 +267,8 @@ def _as_elements(elements: ArrayLike, dim: int) -> Int[np.ndarray, "m corners"]:
     return array.astype(np.int64)
 
 
-def _require_volumes(vertices: np.ndarray, elements: np.ndarray, shape: np.ndarray) -> None:
-    """Refuses flat elements, which have no strain, and vertices without mass or without a second element."""
-    kind, measure = WORDS[vertices.shape[1]]
-    if (bad := np.flatnonzero(np.abs(shape) <= FLAT)).size:
-        raise InputError(
-            f"element {bad[0]} is degenerate: the {measure} of {kind} {elements[bad[0]].tolist()} is "
-            f"{shape[bad[0]]:.1e} of a regular one's; expected more than {FLAT:.0e}; "
-            f"leave it out, merge its corners or move one{_others(bad)}"
-        )
-    uses = np.bincount(elements.ravel(), minlength=len(vertices))
-    if (bad := np.flatnonzero(uses == 0)).size:
-        raise InputError(
-            f"vertex {bad[0]} is dangling: it belongs to no element and would have no mass; remove it{_others(bad)}"
-        )
-    if uses.max() == 1 and (distinct := len(np.unique(vertices, axis=0))) < len(vertices):
-        raise InputError(
-            f"no two of the {len(elements)} elements share a vertex, so that each would move alone; "
-            f"the {len(vertices)} vertices have {distinct} distinct positions: merge those at the same position"
-        )
-
-
-def _require_indices(vertices: np.ndarray, elements: np.ndarray) -> None:
-    """Refuses corners out of range or repeated, and elements that would count twice."""
+def _require_elements(vertices: np.ndarray, elements: np.ndarray) -> Float[np.ndarray, " m"]:
+    """Returns the elements' `regularity`; refuses elements that are wrong, and vertices without a second element."""
     n = len(vertices)
     if (bad := np.flatnonzero(((elements < 0) | (elements >= n)).any(axis=1))).size:
         corners = elements[bad[0]]
@@ -274,6 +289,25 @@ def _require_indices(vertices: np.ndarray, elements: np.ndarray) -> None:
     original = first[inverse.reshape(-1)]
     if (bad := np.flatnonzero(original != np.arange(len(elements)))).size:
         raise InputError(f"element {bad[0]} is a duplicate of element {original[bad[0]]}; remove one{_others(bad)}")
+    shape = regularity(vertices, elements)
+    kind, measure = WORDS[vertices.shape[1]]
+    if (bad := np.flatnonzero(np.abs(shape) <= FLAT)).size:
+        raise InputError(
+            f"element {bad[0]} is degenerate: the {measure} of {kind} {elements[bad[0]].tolist()} is "
+            f"{shape[bad[0]]:.1e} of a regular one's; expected more than {FLAT:.0e}; "
+            f"leave it out, merge its corners or move one{_others(bad)}"
+        )
+    uses = np.bincount(elements.ravel(), minlength=n)
+    if (bad := np.flatnonzero(uses == 0)).size:
+        raise InputError(
+            f"vertex {bad[0]} is dangling: it belongs to no element and would have no mass; remove it{_others(bad)}"
+        )
+    if uses.max() == 1 and (distinct := len(np.unique(vertices, axis=0))) < n:
+        raise InputError(
+            f"no two of the {len(elements)} elements share a vertex, so that each would move alone; "
+            f"the {n} vertices have {distinct} distinct positions: merge those at the same position"
+        )
+    return shape
 
 
 def _as_array(name: str, value: ArrayLike) -> np.ndarray:

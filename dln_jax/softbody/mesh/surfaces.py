@@ -18,8 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from dln_jax.softbody.mesh.mesh import Mesh, boundary
-from dln_jax.softbody.mesh.sets import vertices_in
+from dln_jax.softbody.mesh.mesh import Mesh, boundary, vertices_in
 from dln_jax.softbody.mesh.simplices import SIDES, AnyArray, determinant, facet_rule
 from dln_jax.types import InputError
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from dln_jax.softbody.mesh.mesh import Mesh
-from dln_jax.softbody.mesh.points import located
+from dln_jax.softbody.mesh.simplices import SIDES
 from dln_jax.softbody.terms.term import (
     NOT_NEGATIVE,
     Context,
@@ -29,6 +29,9 @@ from dln_jax.softbody.terms.term import (
     vertex_pairs,
 )
 from dln_jax.types import InputError, Scalar, require_positive
+
+_OUTSIDE = 1e-9
+"""Smallest barycentric coordinate accepted for a point on the surface, to allow for rounding."""
 
 
 class Springs(NamedTuple):
@@ -214,7 +217,7 @@ def _path(mesh: Mesh, path: ArrayLike) -> tuple[Int[np.ndarray, " k"], Float[np.
             raise InputError(f"the path names vertices {points.tolist()}; expected 0..{len(mesh.vertices) - 1}")
         of_points, shares = points[:, None], np.ones((len(points), 1))
     else:
-        of_points, shares = located(mesh, points)
+        of_points, shares = _located(mesh, points)
     if len(points) < 2:
         raise InputError(f"the path has {len(points)} points; expected at least 2: vertices [p] or positions [p, dim]")
     nodes, number = np.unique(of_points[shares != 0], return_inverse=True)
@@ -229,3 +232,36 @@ def _path(mesh: Mesh, path: ArrayLike) -> tuple[Int[np.ndarray, " k"], Float[np.
 
 def _length(points: Float[Array, "p dim"]) -> Float[Array, ""]:
     return jnp.sum(length_of(jnp.sum(jnp.diff(points, axis=0) ** 2, axis=1), 0.0))
+
+
+def _located(mesh: Mesh, points: ArrayLike) -> tuple[Int[np.ndarray, "p nodes"], Float[np.ndarray, "p nodes"]]:
+    """Returns the nodes of the elements that contain points of the rest shape (in m), and the shape functions there.
+
+    A point moves with the body: its position is the sum of its nodes' positions, weighted by these values.
+
+    Raises:
+        InputError: points of a wrong shape, or a point outside the body.
+    """
+    positions = np.asarray(points, dtype=float)
+    if positions.ndim != 2 or positions.shape[1] != mesh.dimension or not np.isfinite(positions).all():
+        raise InputError(
+            f"points have shape {list(positions.shape)}; expected finite numbers [p, {mesh.dimension}], in m"
+        )
+    corners = mesh.vertices[mesh.elements]
+    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    elements, coordinates = [], []
+    for number, point in enumerate(positions):
+        later = np.linalg.solve(edges, (point - corners[:, 0])[..., None])[..., 0]
+        of_elements = np.concatenate([1 - later.sum(axis=1, keepdims=True), later], axis=1)
+        best = int(np.argmax(of_elements.min(axis=1)))
+        if of_elements[best].min() < -_OUTSIDE:
+            raise InputError(
+                f"point {number} at {point.tolist()} m is outside of the body; expected a point in an element"
+            )
+        elements.append(best)
+        coordinates.append(of_elements[best])
+    shares = np.array(coordinates)
+    if mesh.midsides is not None:
+        i, j = np.array(SIDES[mesh.dimension]).T
+        shares = np.concatenate([shares * (2 * shares - 1), 4 * shares[:, i] * shares[:, j]], axis=1)
+    return mesh.nodes[elements], shares
