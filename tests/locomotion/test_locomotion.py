@@ -17,7 +17,6 @@ from dln_jax.commands import train_locomotion
 from dln_jax.figures.animations import write_gif
 from dln_jax.figures.soft_bodies import soft_body_drawing
 from dln_jax.locomotion import learning
-from dln_jax.locomotion.environment import CreatureEnvironment
 from dln_jax.locomotion.gradient import GradientSettings, make_policy, make_updates, targets
 from dln_jax.locomotion.learning import Learned, Record, learn, make_learner, train
 from dln_jax.locomotion.task import (
@@ -42,6 +41,7 @@ from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.springs import muscles
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
+from scripts.reports.cases.locomotion import CreatureEnvironment
 
 EPISODE = 12
 WINDOW = 6
