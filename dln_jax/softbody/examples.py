@@ -24,9 +24,8 @@ from numpy.typing import ArrayLike
 from dln_jax.softbody.contact.barrier import Contact
 from dln_jax.softbody.contact.bodies import body_contact
 from dln_jax.softbody.driven import Example
-from dln_jax.softbody.mesh.changes import quadratic, with_midsides
 from dln_jax.softbody.mesh.mesh import Mesh, boundary, lumped_masses, vertices_where
-from dln_jax.softbody.mesh.shapes import Creature, body_length, box, crawler, disc
+from dln_jax.softbody.mesh.shapes import Creature, body_length, box, crawler, disc, quadratic, with_midsides
 from dln_jax.softbody.mesh.shapes import beam as beam_mesh
 from dln_jax.softbody.scene import SoftScene, make_scene
 from dln_jax.softbody.terms.contact import plane_contact

@@ -26,8 +26,7 @@ from dln_jax.rollout import rollout
 from dln_jax.softbody.contact.bodies import body_contact
 from dln_jax.softbody.contact.crossings import crossings
 from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
-from dln_jax.softbody.mesh.changes import join, rotate, translate
-from dln_jax.softbody.mesh.shapes import beam
+from dln_jax.softbody.mesh.shapes import beam, join, rotate, translate
 from dln_jax.softbody.scene import make_scene
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.elasticity import elastic, mass_damping

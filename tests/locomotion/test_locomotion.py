@@ -33,9 +33,8 @@ from dln_jax.locomotion.task import (
 from dln_jax.locomotion.worlds import Variation
 from dln_jax.scale import AXIS
 from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
-from dln_jax.softbody.mesh.changes import translate
 from dln_jax.softbody.mesh.mesh import make_mesh
-from dln_jax.softbody.mesh.shapes import Creature, lattice
+from dln_jax.softbody.mesh.shapes import Creature, lattice, translate
 from dln_jax.softbody.scene import make_scene
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.loads import gravity

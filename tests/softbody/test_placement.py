@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from calls import one_line
 
-from dln_jax.softbody.mesh.changes import join, quadratic, rotate, translate
 from dln_jax.softbody.mesh.mesh import NamedSet, components, values_by_set, vertices_in, volumes
-from dln_jax.softbody.mesh.shapes import beam, box
+from dln_jax.softbody.mesh.shapes import beam, box, join, quadratic, rotate, translate
 
 BODIES = beam(0.4, 0.2, 2, 1), quadratic(box((0.4, 0.3, 0.2), (2, 1, 1)))
 

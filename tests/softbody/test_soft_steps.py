@@ -16,9 +16,8 @@ from dln_jax.softbody.contact.bodies import body_contact
 from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
 from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.integrators import BDF2, INTEGRATORS, MIDPOINT
-from dln_jax.softbody.mesh.changes import join, quadratic, translate
 from dln_jax.softbody.mesh.mesh import make_mesh
-from dln_jax.softbody.mesh.shapes import beam, lattice
+from dln_jax.softbody.mesh.shapes import beam, join, lattice, quadratic, translate
 from dln_jax.softbody.scene import make_scene, with_parameters
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.elasticity import elastic

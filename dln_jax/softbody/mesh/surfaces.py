@@ -53,11 +53,6 @@ def inner_surface(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
     return np.concatenate(walls)
 
 
-def outer_surface(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
-    """Returns the outer surface of all bodies of a mesh, without the walls of cavities."""
-    return np.concatenate([part for part in surface_parts(mesh) if enclosed_volume(mesh.vertices, part) > 0])
-
-
 def facets_in(mesh: Mesh, name: str) -> Int[np.ndarray, "f dim"]:
     """Returns the facets of the boundary whose corners are all in a named set.
 

@@ -249,18 +249,13 @@ def _located(mesh: Mesh, points: ArrayLike) -> tuple[Int[np.ndarray, "p nodes"],
         )
     corners = mesh.vertices[mesh.elements]
     edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-    elements, coordinates = [], []
-    for number, point in enumerate(positions):
-        later = np.linalg.solve(edges, (point - corners[:, 0])[..., None])[..., 0]
-        of_elements = np.concatenate([1 - later.sum(axis=1, keepdims=True), later], axis=1)
-        best = int(np.argmax(of_elements.min(axis=1)))
-        if of_elements[best].min() < -_OUTSIDE:
-            raise InputError(
-                f"point {number} at {point.tolist()} m is outside of the body; expected a point in an element"
-            )
-        elements.append(best)
-        coordinates.append(of_elements[best])
-    shares = np.array(coordinates)
+    later = np.linalg.solve(edges, (positions[:, None] - corners[:, 0])[..., None])[..., 0]
+    coordinates = np.concatenate([1 - later.sum(axis=2, keepdims=True), later], axis=2)
+    elements = coordinates.min(axis=2).argmax(axis=1)
+    shares = coordinates[np.arange(len(positions)), elements]
+    if len(outside := np.flatnonzero(shares.min(axis=1) < -_OUTSIDE)):
+        point = positions[outside[0]].tolist()
+        raise InputError(f"point {outside[0]} at {point} m is outside of the body; expected a point in an element")
     if mesh.midsides is not None:
         i, j = np.array(SIDES[mesh.dimension]).T
         shares = np.concatenate([shares * (2 * shares - 1), 4 * shares[:, i] * shares[:, j]], axis=1)

@@ -14,9 +14,8 @@ from dln_jax.softbody.contact.candidates import areas, surface_of
 from dln_jax.softbody.contact.crossings import _segments_meet_triangles, count_overlaps, crossings
 from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
 from dln_jax.softbody.integrators import AVERAGE_VECTOR_FIELD, MIDPOINT
-from dln_jax.softbody.mesh.changes import join, quadratic, translate
 from dln_jax.softbody.mesh.mesh import Mesh, vertices_where
-from dln_jax.softbody.mesh.shapes import beam, box
+from dln_jax.softbody.mesh.shapes import beam, box, join, quadratic, translate
 from dln_jax.softbody.scene import make_scene, prepare_contacts
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.elasticity import elastic
