@@ -11,20 +11,45 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dln_jax.softbody.mesh.solids import DIMENSIONS, FileMesh, base
+from dln_jax.softbody.mesh.solids import CELLS, FileMesh, corners_by_kind
 from dln_jax.types import InputError
 
 Take = Callable[[str, Any], np.ndarray]
 """(type, count) -> the next numbers of a section."""
 
 KINDS = {
-    **{1: "line2", 2: "triangle3", 3: "quad4", 4: "tetra4", 5: "hexahedron8", 6: "wedge6", 7: "pyramid5", 8: "line3"},
-    **{9: "triangle6", 10: "quad9", 11: "tetra10", 12: "hexahedron27", 13: "wedge18", 14: "pyramid14", 15: "vertex1"},
-    **{16: "quad8", 17: "hexahedron20", 18: "wedge15", 19: "pyramid13", 21: "triangle10", 23: "triangle15"},
-    **{25: "triangle21", 26: "line4", 27: "line5", 28: "line6", 29: "tetra20", 30: "tetra35", 31: "tetra56"},
-    **{36: "quad16", 37: "quad25"},
+    1: "line2",
+    2: "triangle3",
+    3: "quad4",
+    4: "tetra4",
+    5: "hexahedron8",
+    6: "wedge6",
+    7: "pyramid5",
+    8: "line3",
+    9: "triangle6",
+    10: "quad9",
+    11: "tetra10",
+    12: "hexahedron27",
+    13: "wedge18",
+    14: "pyramid14",
+    15: "vertex1",
+    16: "quad8",
+    17: "hexahedron20",
+    18: "wedge15",
+    19: "pyramid13",
+    21: "triangle10",
+    23: "triangle15",
+    25: "triangle21",
+    26: "line4",
+    27: "line5",
+    28: "line6",
+    29: "tetra20",
+    30: "tetra35",
+    31: "tetra56",
+    36: "quad16",
+    37: "quad25",
 }
-"""Kind of cell by Gmsh's number, and number of its nodes at the end; corners come first in all of them."""
+"""Kind of cell by Gmsh's number, and number of its nodes at the end."""
 GEOMETRY = ("point", "curve", "surface", "volume")
 """Physical groups without a name get these names and their number, such as surface-3."""
 
@@ -81,23 +106,22 @@ def _gathered(tags: np.ndarray, points: np.ndarray, blocks: list[_Block], names:
     A named group without elements becomes an empty set: MSH 2.2 with `Mesh.SaveAll` keeps only the names.
     """
     order = np.argsort(tags, kind="stable")
-    cells: dict[str, np.ndarray] = {}
+    cells, curved = corners_by_kind([(block.kind, block.nodes) for block in blocks])
     sets: dict[str, dict[str, list[np.ndarray]]] = {name: {} for name in names}
-    for kind in dict.fromkeys(block.kind for block in blocks):
-        own = [block for block in blocks if block.kind == kind]
-        nodes = np.concatenate([block.nodes for block in own]).astype(np.int64)
+    starts = dict.fromkeys(cells, 0)
+    for kind, nodes, groups in blocks:
+        for name in groups:
+            sets.setdefault(name, {}).setdefault(kind, []).append(starts[kind] + np.arange(len(nodes)))
+        starts[kind] += len(nodes)
+    for kind, nodes in cells.items():
         place = np.searchsorted(tags[order], nodes).clip(max=len(tags) - 1)
         if len(unknown := np.argwhere(tags[order][place] != nodes)):
             raise InputError(
-                f"{base(kind)} {unknown[0][0]} has node {nodes[tuple(unknown[0])]}, which the file does not list"
+                f"{kind} {unknown[0][0]} has node {nodes[tuple(unknown[0])]}, which the file does not list"
             )
-        cells[kind], start = order[place], 0
-        for block in own:
-            for name in block.groups:
-                sets.setdefault(name, {}).setdefault(kind, []).append(start + np.arange(len(block.nodes)))
-            start += len(block.nodes)
+        cells[kind] = order[place]
     joined = {name: {kind: np.concatenate(parts) for kind, parts in kinds.items()} for name, kinds in sets.items()}
-    return FileMesh(points, cells, {}, joined)
+    return FileMesh(points, cells, {}, joined, curved)
 
 
 def _sections(data: bytes) -> Iterator[tuple[str, bytes]]:
@@ -210,15 +234,16 @@ def _elements_2(
         table, kind = np.concatenate(parts)[:, int(binary) :], _kind(number)[0]
         groups = table[:, 0] if tags else np.zeros(len(table), np.int64)
         for group in np.unique(groups).tolist():
-            name = (_name(names, DIMENSIONS[base(kind)], group),) if group else ()
+            name = (_name(names, CELLS[kind][0], group),) if group else ()
             yield _Block(kind, table[groups == group][:, tags:], name)
 
 
 def _kind(number: Any) -> tuple[str, int]:
-    """Returns the kind of cell with this number of Gmsh, and the number of its nodes."""
+    """Returns the linear kind of the cells with this number of Gmsh, and the number of their nodes."""
     if (kind := KINDS.get(int(number))) is None:
         raise InputError(f"it has elements of Gmsh's type {number}; expected linear triangles or tetrahedra")
-    return kind, int(kind.removeprefix(base(kind)))
+    linear = kind.rstrip("0123456789")
+    return linear, int(kind.removeprefix(linear))
 
 
 def _name(names: dict[tuple[int, int], str], dimension: int, tag: int) -> str:
