@@ -134,9 +134,9 @@ def _kinds(surface: Surface, rest: np.ndarray, distance: float) -> tuple[Kind, .
     def kind(one: Group, other: Group, number: int) -> Kind:
         return Kind(one, other, number, meetings(one, other, rest, distance))
 
-    if surface.dimension == 2:
+    if surface.sides is None:
         return (kind(vertices, edges, 0),)
-    triangles = group(surface.triangles, rest)
+    triangles = group(surface.facets, rest)
     return kind(vertices, triangles, POINT_TRIANGLE), kind(edges, edges, EDGE_EDGE)
 
 
@@ -209,7 +209,7 @@ def _described(surface: Surface, x: Array, elements: Elements, data: Any) -> Pai
     of_vertices, of_edges = areas(surface, rest)
     stencil = jax.vmap(stencil_of)(jax.lax.stop_gradient(x[elements.indices]), number)
     # A pair of facets is counted from both sides: in space by vertices and by edges (Li et al. 2023, section 4).
-    if surface.dimension == 2:
+    if surface.sides is None:
         area, parallel = of_vertices[one] / 2, jnp.zeros_like(rest, shape=one.shape)
     else:
         a, b, c, d = (rest[corner] for corner in elements.indices.T)

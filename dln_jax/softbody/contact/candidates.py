@@ -31,16 +31,14 @@ _PARTS = {3: ((0, 2), (2, 1)), 6: ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))}
 
 
 class Surface(NamedTuple):
-    """Primitives of the boundary, as vertex indices. A body in the plane has no triangles."""
+    """Primitives of the boundary, as vertex indices."""
 
     vertices: Int[np.ndarray, " v"]
     edges: Int[np.ndarray, "e 2"]
-    triangles: Int[np.ndarray, "f 3"]
-
-    @property
-    def dimension(self) -> int:
-        """2 or 3."""
-        return 3 if len(self.triangles) else 2
+    facets: Int[np.ndarray, "f dim"]
+    """The edges in the plane, triangles in space."""
+    sides: Int[np.ndarray, "f 3"] | None
+    """Edges of every triangle; `None` in the plane."""
 
 
 class Group(NamedTuple):
@@ -59,9 +57,11 @@ def surface_of(mesh: Mesh) -> Surface:
         nodes = facet_nodes(mesh, facets)
         facets = nodes[:, np.array(_PARTS[nodes.shape[1]])].reshape(-1, mesh.dimension)
     if mesh.dimension == 2:
-        return Surface(np.unique(facets), np.sort(facets, axis=1), np.zeros((0, 3), int))
-    pairs = facets[:, list(itertools.combinations(range(3), 2))].reshape(-1, 2)
-    return Surface(np.unique(facets), np.unique(np.sort(pairs, axis=1), axis=0), facets)
+        edges = np.sort(facets, axis=1)
+        return Surface(np.unique(facets), edges, edges, None)
+    pairs = np.sort(facets[:, list(itertools.combinations(range(3), 2))], axis=2)
+    edges, sides = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
+    return Surface(np.unique(facets), edges, facets, sides.reshape(-1, 3))
 
 
 def areas(surface: Surface, rest: Float[Array, "n dim"]) -> tuple[Float[Array, " v"], Float[Array, " e"]]:
@@ -69,26 +69,14 @@ def areas(surface: Surface, rest: Float[Array, "n dim"]) -> tuple[Float[Array, "
 
     In the plane, for a thickness of 1 m, a vertex gets half the lengths of its edges and an edge its length.
     """
-    if surface.dimension == 2:
-        lengths = jnp.linalg.norm(rest[surface.edges[:, 1]] - rest[surface.edges[:, 0]], axis=1)
-        return _shared(surface.vertices[:, None], surface.edges, lengths / 2), lengths
-    a, b, c = (rest[corner] for corner in surface.triangles.T)
-    thirds = jnp.linalg.norm(jnp.cross(b - a, c - a), axis=1) / 6
-    return (
-        _shared(surface.vertices[:, None], surface.triangles, thirds),
-        _shared(surface.edges, surface.triangles, thirds),
-    )
-
-
-def _shared(primitives: np.ndarray, facets: np.ndarray, share: Float[Array, " facets"]) -> Float[Array, " primitives"]:
-    """Adds up, for every primitive, the shares of the facets that contain it."""
-    k = primitives.shape[1]
-    parts = np.sort(facets[:, list(itertools.combinations(range(facets.shape[1]), k))], axis=2)
-    _, number = np.unique(np.concatenate([primitives, parts.reshape(-1, k)]), axis=0, return_inverse=True)
-    order = np.zeros(len(primitives), int)
-    order[number.reshape(-1)[: len(primitives)]] = np.arange(len(primitives))
-    owners = order[number.reshape(-1)[len(primitives) :]]
-    return jnp.zeros(len(primitives), share.dtype).at[owners].add(jnp.repeat(share, parts.shape[1]))
+    first, second, *third = (rest[corner] for corner in surface.facets.T)
+    if third:
+        share = jnp.linalg.norm(jnp.cross(second - first, third[0] - first), axis=1) / 6
+        of_edges = jnp.zeros(len(surface.edges), rest.dtype).at[surface.sides].add(share[:, None])
+    else:
+        of_edges = jnp.linalg.norm(second - first, axis=1)
+        share = of_edges / 2
+    return jnp.zeros(len(rest), rest.dtype).at[surface.facets].add(share[:, None])[surface.vertices], of_edges
 
 
 def group(primitives: Int[np.ndarray, "m k"], rest: Float[np.ndarray, "n dim"]) -> Group:

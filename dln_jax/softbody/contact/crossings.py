@@ -26,12 +26,14 @@ def crossings(mesh: Mesh, x: Float[np.ndarray, "n dim"]) -> list[tuple[tuple[int
     Pairs are two edges in the plane, an edge and a triangle in space; pairs with a common vertex are left out. If two
     triangles in space cross, an edge of one crosses the other.
     """
-    return _crossing(np.asarray(x, float), *_edges_and_facets(mesh))
+    surface = surface_of(mesh)
+    return _crossing(np.asarray(x, float), surface.edges, surface.facets)
 
 
 def count_overlaps(mesh: Mesh) -> Callable[[Float[np.ndarray, "n dim"]], int] | None:
     """Returns positions -> number of pairs of components that touch or overlap; `None` for a mesh of one component."""
-    label, (edges, facets) = components_of_vertices(mesh), _edges_and_facets(mesh)
+    label = components_of_vertices(mesh)
+    _, edges, facets, _ = surface_of(mesh)
     owners = label[facets[:, 0]]
     _, first = np.unique(label, return_index=True)
     if len(first) == 1:
@@ -51,11 +53,6 @@ def count_overlaps(mesh: Mesh) -> Callable[[Float[np.ndarray, "n dim"]], int] | 
         return sum(len(pair) == 2 for pair in met)
 
     return count
-
-
-def _edges_and_facets(mesh: Mesh) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "f dim"]]:
-    surface = surface_of(mesh)
-    return surface.edges, surface.edges if mesh.dimension == 2 else surface.triangles
 
 
 def _crossing(

@@ -36,7 +36,7 @@ def ours(mesh):
 
 def reference(mesh, x):
     surface = surface_of(mesh)
-    faces = surface.triangles if mesh.dimension == 3 else np.zeros((0, 3), int)
+    faces = surface.facets if mesh.dimension == 3 else np.zeros((0, 3), int)
     collision_mesh = ipctk.CollisionMesh(np.asfortranarray(mesh.vertices), surface.edges, faces)
     assert collision_mesh.num_vertices == len(x)
     collisions = ipctk.NormalCollisions()
