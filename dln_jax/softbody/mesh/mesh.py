@@ -12,10 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from dln_jax.softbody.mesh.simplices import facets, regularity, simplex_volumes
+from dln_jax.softbody.mesh.simplices import connected, facets, regularity, simplex_volumes
 from dln_jax.types import InputError
 
 FLAT = 1e-12
@@ -129,11 +127,7 @@ def indices_of(name: str, values: Any, count: int, what: str = "vertex") -> Int[
 
 def components(mesh: Mesh) -> Int[np.ndarray, " m"]:
     """Returns the component of every element, counted from 0; shared vertices connect elements."""
-    n, m = len(mesh.vertices), len(mesh.elements)
-    corners = mesh.elements.ravel()
-    first = np.repeat(mesh.elements[:, 0], mesh.elements.shape[1])
-    _, of_vertices = connected_components(coo_array((np.ones(len(corners)), (first, corners)), shape=(n, n)))
-    return np.unique(of_vertices[mesh.elements[:, 0]], return_inverse=True)[1].reshape(m)
+    return connected(mesh.elements)
 
 
 def components_of_vertices(mesh: Mesh) -> Int[np.ndarray, " n"]:

@@ -11,6 +11,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 AnyArray = TypeVar("AnyArray", np.ndarray, Array)
 
@@ -132,3 +134,11 @@ def regularity(vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray, "
 def facets(elements: Int[np.ndarray, "m corners"]) -> Int[np.ndarray, "m corners dim"]:
     """Returns the facets of all elements, oriented outwards unless the element is inverted."""
     return elements[:, np.array(FACETS[elements.shape[1] - 1])]
+
+
+def connected(rows: Int[np.ndarray, "m k"]) -> Int[np.ndarray, " m"]:
+    """Returns the component of every row, counted from 0; common numbers connect rows."""
+    size = int(rows.max()) + 1
+    pairs = np.repeat(rows[:, 0], rows.shape[1]), rows.ravel()
+    _, label = connected_components(coo_array((np.ones(rows.size), pairs), shape=(size, size)))
+    return np.unique(label[rows[:, 0]], return_inverse=True)[1].reshape(-1)

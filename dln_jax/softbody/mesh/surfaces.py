@@ -15,11 +15,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from dln_jax.softbody.mesh.mesh import Mesh, boundary, vertices_in
-from dln_jax.softbody.mesh.simplices import SIDES, AnyArray, determinant, facet_rule
+from dln_jax.softbody.mesh.simplices import SIDES, AnyArray, connected, determinant, facet_rule
 from dln_jax.types import InputError
 
 RIDGES = {2: "vertex", 3: "edge"}
@@ -33,11 +31,8 @@ def surface_parts(mesh: Mesh) -> list[Int[np.ndarray, "f dim"]]:
     outside = boundary(mesh)
     ridges, _ = _ridges(outside)
     _, number = np.unique(ridges.reshape(-1, mesh.dimension - 1), axis=0, return_inverse=True)
-    number = number.reshape(len(outside), -1)
-    count = len(outside) + number.max() + 1
-    pairs = np.repeat(np.arange(len(outside)), number.shape[1]), len(outside) + number.ravel()
-    _, label = connected_components(coo_array((np.ones(number.size), pairs), shape=(count, count)))
-    parts = [outside[label[: len(outside)] == part] for part in np.unique(label[: len(outside)])]
+    label = connected(number.reshape(len(outside), -1))
+    parts = [outside[label == part] for part in range(label.max() + 1)]
     return sorted(parts, key=lambda part: -float(enclosed_volume(mesh.vertices, part)))
 
 
@@ -125,17 +120,16 @@ def facet_nodes(mesh: Mesh, facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray,
     if mesh.midsides is None:
         return facets
     sides = np.array([[0, 1]] if mesh.dimension == 2 else SIDES[2])
-    size = np.array([len(mesh.vertices), 1])
-    keys = np.sort(mesh.elements[:, np.array(SIDES[mesh.dimension])].reshape(-1, 2), axis=1) @ size
-    order = np.argsort(keys)
-    wanted = np.sort(facets[:, sides], axis=2) @ size
-    place = order[np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)]
-    if len(missing := np.argwhere(keys[place] != wanted)):
-        edge = facets[missing[0][0], sides[missing[0][1]]].tolist()
+    edges = np.sort(mesh.elements[:, np.array(SIDES[mesh.dimension])].reshape(-1, 2), axis=1)
+    middles = dict(zip(map(tuple, edges.tolist()), mesh.midsides.ravel().tolist(), strict=True))
+    wanted = np.sort(facets[:, sides], axis=2).tolist()
+    try:
+        nodes = [[middles[tuple(edge)] for edge in of_facet] for of_facet in wanted]
+    except KeyError as error:
         raise InputError(
-            f"edge {edge} of a facet is not an edge of the quadratic mesh; only linear meshes can have caps"
-        )
-    return np.concatenate([facets, mesh.midsides.reshape(-1)[place]], axis=1)
+            f"edge {list(error.args[0])} of a facet is not an edge of the quadratic mesh; only linear ones can have caps"
+        ) from None
+    return np.append(facets, nodes, axis=1)
 
 
 def enclosed_volume(x: Float[AnyArray, "n dim"], nodes: Int[np.ndarray, "f nodes"]) -> Any:
