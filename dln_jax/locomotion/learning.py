@@ -223,7 +223,12 @@ def learn(
     state = learner.start(seed)
     best, records = state.averaged, []
     if resume and directory is not None and has_checkpoint(directory, name):
-        (state, best), records = _restored(directory, name, identity, (state, best))
+        manifest = checkpoints.load_manifest(directory, name)
+        if manifest.get("settings") != finite_values(identity["settings"]):
+            raise InputError(f"{directory}: the run was started with other settings; give those it was started with")
+        rows = stored_rows(directory / f"{name}.json", manifest, "records", tuple[int, float, float | None, int, float])
+        records = [Record(done, seconds, math.nan if d is None else d, *rest) for done, seconds, d, *rest in rows]
+        state, best = checkpoints.load_tree(directory, name, (state, best))
     highest = max(map(rank, records), default=rank(None))
     before = records[-1].seconds if records else learner.seconds
     began = time.perf_counter()
@@ -242,15 +247,6 @@ def learn(
                 checkpoints.save_tree(directory, name, (state, best), stored, number=done)
         report(records[-1])
     return Learned(local(best, learner.mesh), records, learner.seconds)
-
-
-def _restored(directory: Path, name: str, identity: dict[str, Any], like: Any) -> tuple[Any, list[Record]]:
-    manifest = checkpoints.load_manifest(directory, name)
-    if manifest.get("settings") != finite_values(identity["settings"]):
-        raise InputError(f"{directory}: the run was started with other settings; give those it was started with")
-    rows = stored_rows(directory / f"{name}.json", manifest, "records", tuple[int, float, float | None, int, float])
-    records = [Record(steps, seconds, math.nan if d is None else d, *rest) for steps, seconds, d, *rest in rows]
-    return checkpoints.load_tree(directory, name, like), records
 
 
 class Trials(NamedTuple):

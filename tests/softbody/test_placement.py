@@ -27,5 +27,5 @@ def test_bodies_are_joined_with_their_sets(body):
 def test_what_cannot_be_joined_or_moved_is_refused():
     with one_line("differ in dimension"):
         join(*BODIES)
-    with one_line("expected 2 finite numbers"):
+    with one_line(r"expected .2,"):
         translate(BODIES[0], 1.0)

@@ -7,7 +7,7 @@ several; this reader accepts all of them.
 
 import re
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from dln_jax.types import InputError
 
 Take = Callable[[str, Any], np.ndarray]
 """(type, count) -> the next numbers of a section."""
+_Block = tuple[str, np.ndarray, tuple[str, ...]]
+"""Kind and nodes of cells that are in the same physical groups, and these groups."""
 
 KINDS = {
     1: "line2",
@@ -52,14 +54,6 @@ KINDS = {
 """Kind of cell by Gmsh's number, and number of its nodes at the end."""
 GEOMETRY = ("point", "curve", "surface", "volume")
 """Physical groups without a name get these names and their number, such as surface-3."""
-
-
-class _Block(NamedTuple):
-    """Cells of one kind that are in the same physical groups."""
-
-    kind: str
-    nodes: np.ndarray
-    groups: tuple[str, ...]
 
 
 def read_gmsh(data: bytes) -> FileMesh:
@@ -106,7 +100,7 @@ def _gathered(tags: np.ndarray, points: np.ndarray, blocks: list[_Block], names:
     A named group without elements becomes an empty set: MSH 2.2 with `Mesh.SaveAll` keeps only the names.
     """
     order = np.argsort(tags, kind="stable")
-    cells, curved = corners_by_kind([(block.kind, block.nodes) for block in blocks])
+    cells, curved = corners_by_kind([(kind, nodes) for kind, nodes, _ in blocks])
     sets: dict[str, dict[str, list[np.ndarray]]] = {name: {} for name in names}
     starts = dict.fromkeys(cells, 0)
     for kind, nodes, groups in blocks:
@@ -201,7 +195,7 @@ def _elements(take: Take, groups: dict[tuple[int, int], tuple[str, ...]]) -> Ite
         kind, nodes = _kind(number)
         count = take("n", 1)[0]
         rows = take("n", count * (1 + nodes)).reshape(count, 1 + nodes)
-        yield _Block(kind, rows[:, 1:], groups.get((int(dimension), int(tag)), ()))
+        yield kind, rows[:, 1:], groups.get((int(dimension), int(tag)), ())
 
 
 def _nodes_2(section: bytes, binary: bool, order: str) -> tuple[np.ndarray, np.ndarray]:
@@ -235,7 +229,7 @@ def _elements_2(
         groups = table[:, 0] if tags else np.zeros(len(table), np.int64)
         for group in np.unique(groups).tolist():
             name = (_name(names, CELLS[kind][0], group),) if group else ()
-            yield _Block(kind, table[groups == group][:, tags:], name)
+            yield kind, table[groups == group][:, tags:], name
 
 
 def _kind(number: Any) -> tuple[str, int]:

@@ -80,12 +80,6 @@ def volumes(mesh: Mesh) -> Float[np.ndarray, " m"]:
     return simplex_volumes(mesh.vertices, mesh.nodes)
 
 
-def edges(mesh: Mesh) -> Int[np.ndarray, "e 2"]:
-    """Returns the distinct edges in lexicographic order, each with the smaller vertex first."""
-    pairs = list(itertools.combinations(range(mesh.dimension + 1), 2))
-    return np.unique(np.sort(mesh.elements[:, pairs].reshape(-1, 2), axis=1), axis=0)
-
-
 def boundary(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
     """Returns the facets with the body on one side only, oriented outwards.
 

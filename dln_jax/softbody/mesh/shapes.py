@@ -14,14 +14,14 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from dln_jax.errors import require_memory
 from dln_jax.softbody.mesh.mesh import Mesh, NamedSet, boundary, indices_of, make_mesh
 from dln_jax.softbody.mesh.simplices import SIDES
-from dln_jax.types import InputError, require_positive
+from dln_jax.types import InputError, finite_array, require_positive
 
 # Lattice cells are cut so that every diagonal joins two vertices with an even sum of coordinates: neighbours are mirror
 # images, so they fit, and no direction is preferred. In space a cell is one regular tetrahedron between four alternate
@@ -224,7 +224,7 @@ def join(*meshes: Mesh, **bodies: Mesh) -> Mesh:
 
 def translate(mesh: Mesh, offset: ArrayLike) -> Mesh:
     """Returns the mesh moved by an offset [dim] in m."""
-    return mesh._replace(vertices=mesh.vertices + _vector(mesh, "offset", offset, mesh.dimension))
+    return mesh._replace(vertices=mesh.vertices + finite_array("offset", offset, (mesh.dimension,)))
 
 
 def rotate(mesh: Mesh, rotation: ArrayLike, *, about: ArrayLike | None = None) -> Mesh:
@@ -236,17 +236,10 @@ def rotate(mesh: Mesh, rotation: ArrayLike, *, about: ArrayLike | None = None) -
         about: the point [dim], m.
     """
     size = 1 if mesh.dimension == 2 else 3
-    turn = _vector(mesh, "rotation", np.atleast_1d(rotation), size)
+    turn = finite_array("rotation", np.atleast_1d(rotation), (size,))
     R = Rotation.from_rotvec(turn if size == 3 else [0.0, 0.0, turn[0]]).as_matrix()[: mesh.dimension, : mesh.dimension]
-    centre = mesh.vertices.mean(axis=0) if about is None else _vector(mesh, "about", about, mesh.dimension)
+    centre = mesh.vertices.mean(axis=0) if about is None else finite_array("about", about, (mesh.dimension,))
     return mesh._replace(vertices=(mesh.vertices - centre) @ R.T + centre)
-
-
-def _vector(mesh: Mesh, name: str, values: ArrayLike, size: int) -> Float[np.ndarray, " size"]:
-    vector = np.asarray(values, float)
-    if vector.shape != (size,) or not np.isfinite(vector).all():
-        raise InputError(f"{name} is {values}; expected {size} finite number{'s' * (size > 1)} in {mesh.dimension}-D")
-    return vector
 
 
 def quadratic(mesh: Mesh) -> Mesh:

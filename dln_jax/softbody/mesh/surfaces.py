@@ -127,7 +127,7 @@ def facet_nodes(mesh: Mesh, facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray,
         nodes = [[middles[tuple(edge)] for edge in of_facet] for of_facet in wanted]
     except KeyError as error:
         raise InputError(
-            f"edge {list(error.args[0])} of a facet is not an edge of the quadratic mesh; only linear ones can have caps"
+            f"edge {list(error.args[0])} of a facet is no edge of the quadratic mesh; only linear meshes can have caps"
         ) from None
     return np.append(facets, nodes, axis=1)
 

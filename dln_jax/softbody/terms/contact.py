@@ -44,7 +44,7 @@ from dln_jax.softbody.terms.term import (
     material,
     require_dimension,
     vector,
-    vertex_list,
+    vertex_rows,
 )
 from dln_jax.types import InputError, Scalar, require_positive
 
@@ -106,7 +106,7 @@ def plane_contact(
     require_positive(threshold_speed=threshold_speed)
     if width != 0.0:
         require_positive(width=width)
-    indices = vertex_list("vertices in contact", vertices)
+    indices = vertex_rows("vertices in contact", vertices, 1)
     count = len(indices)
     parameters = PlaneContact(
         vector("the normal of a plane", normal, zero_allowed=False),

@@ -40,7 +40,7 @@ from dln_jax.softbody.terms.term import (
     require_dimension,
     value_or_control,
     vector,
-    vertex_list,
+    vertex_rows,
 )
 from dln_jax.types import InputError, Scalar, require_positive
 
@@ -104,7 +104,7 @@ def point_force(mesh: Mesh, vertices: Indices, force: Numbers | None = None, *, 
     Raises:
         InputError: the vertices or the force do not fit the mesh.
     """
-    indices = vertex_list("vertices with a force", vertices)
+    indices = vertex_rows("vertices with a force", vertices, 1)
     return _load(name, mesh, indices[:, 0], force, lambda _: jnp.ones(len(indices)), per_vertex=True)
 
 

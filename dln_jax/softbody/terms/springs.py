@@ -26,7 +26,7 @@ from dln_jax.softbody.terms.term import (
     Term,
     material,
     value_or_control,
-    vertex_pairs,
+    vertex_rows,
 )
 from dln_jax.types import InputError, Scalar, require_positive
 
@@ -80,7 +80,7 @@ def springs(
     carries no force). Without softening, the force of a compressed spring has no direction at d = 0 and its stiffness
     no bound. Exactly there, only the well-defined parts are kept (zero force, stiffness k), which is exact for l0 = 0.
     """
-    indices = vertex_pairs("pairs of springs", pairs)
+    indices = vertex_rows("pairs of springs", pairs, 2)
     count = len(indices)
     if rest_length is not None:
         rest_length = material("rest_length", rest_length, count, "spring", NOT_NEGATIVE)
@@ -101,7 +101,7 @@ def muscles(pairs: Indices, *, stiffness: Numbers, softening: float = 1e-3, name
     l0 is the distance in the rest shape, which must not be zero, and a > 0 the actuation: the `control` [m] of the
     step, in the order of the pairs. k is in J and softening in m.
     """
-    indices = vertex_pairs("pairs of muscles", pairs)
+    indices = vertex_rows("pairs of muscles", pairs, 2)
     count = len(indices)
     parameters = Muscles(material("stiffness", stiffness, count, "muscle"))
 
