@@ -206,11 +206,10 @@ def observe(task: LocomotionTask, place: EpisodeState) -> Float[Array, " o"]:
         ahead = jnp.eye(3, dtype=x.dtype)[0] - up[0] * up
         directions.append(R @ (ahead / jnp.linalg.norm(ahead)))
     parts = [moved.ravel() / (POSITION_UNIT * task.length), (place.state.v @ R.T).ravel() / task.length]
+    directions.append(place.actuation)
     if task.clock_period:
         angle = 2.0 * jnp.pi / task.clock_period * place.steps.astype(x.dtype)
-        directions += [place.actuation, jnp.stack([jnp.sin(angle), jnp.cos(angle)])]
-    else:
-        directions.append(place.actuation)
+        directions.append(jnp.stack([jnp.sin(angle), jnp.cos(angle)]))
     return jnp.concatenate([*parts, *directions])
 
 

@@ -75,22 +75,24 @@ def read_gmsh(data: bytes) -> FileMesh:
     binary = form[1] == b"1"
     if binary and form[2] not in (b"4", b"8"):
         raise InputError(f"its numbers have {form[2].decode(errors='replace'):.10} bytes; expected 4 or 8")
-    order = ">" if binary and form[3][:4] == b"\0\0\0\1" else "<"
-    types = {"i": f"{order}i4", "d": f"{order}f8", "n": f"{order}u{int(form[2])}"}
+    types = None
+    if binary:
+        order = ">" if form[3][:4] == b"\0\0\0\1" else "<"
+        types = {"i": f"{order}i4", "d": f"{order}f8", "n": f"{order}u{int(form[2])}"}
     names = {
         (int(dimension), int(tag)): name.decode(errors="replace")
         for dimension, tag, name in re.findall(rb'(\d+)\s+(\d+)\s+"(.*)"', sections.get("PhysicalNames", b""))
     }
 
     def reader(name: str) -> Take:
-        return _binary(sections[name], types) if binary else _ascii(sections[name])
+        return _reader(sections[name], types)
 
     if version == "4.1":
         tags, points = _nodes(reader("Nodes"))
         blocks = list(_elements(reader("Elements"), _groups(reader, sections, names)))
     else:
-        tags, points = _nodes_2(sections["Nodes"], binary, order)
-        blocks = list(_elements_2(sections["Elements"], binary, types, names))
+        tags, points = _nodes_2(sections["Nodes"], types)
+        blocks = list(_elements_2(sections["Elements"], types, names))
     return _gathered(tags, points, blocks, list(names.values()))
 
 
@@ -131,28 +133,21 @@ def _sections(data: bytes) -> Iterator[tuple[str, bytes]]:
         at = end + len(name) + 4
 
 
-def _ascii(section: bytes) -> Take:
-    numbers, at = np.fromiter(map(float, section.split()), np.float64), 0
-
-    def take(kind: str, count: Any) -> np.ndarray:
-        nonlocal at
-        part, at = numbers[at : at + int(count)], at + int(count)
-        if len(part) != count:
-            raise ValueError("a section has fewer numbers than its header states")
-        return part if kind == "d" else part.astype(np.int64)
-
-    return take
-
-
-def _binary(section: bytes, types: dict[str, str]) -> Take:
+def _reader(section: bytes, types: dict[str, str] | None) -> Take:
+    """Returns a function that reads one number after another: of these types in NumPy's words, or as text."""
+    numbers = np.fromiter(map(float, section.split() if types is None else ()), np.float64)
     at = 0
 
     def take(kind: str, count: Any) -> np.ndarray:
         nonlocal at
-        part = np.frombuffer(section, types[kind], int(count), at) if count else np.zeros(0)
+        if types is None:
+            part = numbers[at : at + int(count)]
+            at += len(part)
+        else:
+            part = np.frombuffer(section, types[kind], int(count), at) if count else np.zeros(0)
+            at += part.nbytes
         if len(part) != count:  # a negative count takes all
             raise ValueError("a section has fewer numbers than its header states")
-        at += part.nbytes
         return part.astype(np.float64 if kind == "d" else np.int64)
 
     return take
@@ -198,22 +193,20 @@ def _elements(take: Take, groups: dict[tuple[int, int], tuple[str, ...]]) -> Ite
         yield kind, rows[:, 1:], groups.get((int(dimension), int(tag)), ())
 
 
-def _nodes_2(section: bytes, binary: bool, order: str) -> tuple[np.ndarray, np.ndarray]:
+def _nodes_2(section: bytes, types: dict[str, str] | None) -> tuple[np.ndarray, np.ndarray]:
     """Returns tags and positions of the nodes, version 2.2."""
     count, _, content = section.partition(b"\n")
-    if binary:
-        rows = np.frombuffer(content, [("tag", f"{order}i4"), ("x", f"{order}f8", 3)], int(count))
+    if types is not None:
+        rows = np.frombuffer(content, [("tag", types["i"]), ("x", types["d"], 3)], int(count))
         return rows["tag"].astype(np.int64), rows["x"].astype(np.float64)
-    table = _ascii(content)("d", 4 * int(count)).reshape(-1, 4)
+    table = _reader(content, None)("d", 4 * int(count)).reshape(-1, 4)
     return table[:, 0].astype(np.int64), table[:, 1:]
 
 
-def _elements_2(
-    section: bytes, binary: bool, types: dict[str, str], names: dict[tuple[int, int], str]
-) -> Iterator[_Block]:
+def _elements_2(section: bytes, types: dict[str, str] | None, names: dict[tuple[int, int], str]) -> Iterator[_Block]:
     """Yields elements of version 2.2: the first tag of an element is its group, and every group lists it once."""
     count, _, content = section.partition(b"\n")
-    take = _binary(content, types) if binary else _ascii(content)
+    take, binary = _reader(content, types), types is not None
     tables: dict[tuple[int, int], list[np.ndarray]] = {}
     read = 0
     while read < int(count):
