@@ -68,8 +68,23 @@ def make_mesh(vertices: ArrayLike, elements: ArrayLike) -> Mesh:
             repeated, a duplicate or degenerate element, a vertex in no element. Also if elements share no vertices
             although some of their corners coincide: the vertices of such a mesh were never merged.
     """
-    positions = _as_vertices(vertices)
-    corners = _as_elements(elements, positions.shape[1])
+    positions = _as_array("vertices", vertices)
+    if positions.dtype.kind not in "iuf":
+        raise InputError(f"vertices has type {positions.dtype}; expected real numbers: positions in m")
+    if positions.ndim != 2 or positions.shape[1] not in (2, 3):
+        raise InputError(f"vertices has shape {list(positions.shape)}; expected [n, 2] (plane) or [n, 3] (space)")
+    positions = positions.astype(np.float64)
+    if (bad := np.flatnonzero(~np.isfinite(positions).all(axis=1))).size:
+        raise InputError(f"vertex {bad[0]} is at {positions[bad[0]].tolist()}; expected finite numbers{_others(bad)}")
+    corners, dim = _as_array("elements", elements), positions.shape[1]
+    if corners.ndim != 2 or corners.shape[1] != dim + 1 or not corners.shape[0]:
+        raise InputError(
+            f"elements has shape {list(corners.shape)}; expected [m, {dim + 1}] with m >= 1, "
+            f"the corners of each {WORDS[dim][0]}, as vertices has {dim} columns"
+        )
+    if corners.dtype.kind not in "iu":
+        raise InputError(f"elements has type {corners.dtype}; expected integers: the indices of vertices")
+    corners = corners.astype(np.int64)
     inverted = _require_elements(positions, corners) < 0
     turned = np.where(inverted[:, None], corners[:, [*range(corners.shape[1] - 2), -1, -2]], corners)
     return Mesh(positions, turned.astype(np.int32), int(inverted.sum()))
@@ -228,31 +243,6 @@ def _facet_sides(mesh: Mesh) -> tuple[Int[np.ndarray, "f dim"], Int[np.ndarray, 
     counts = np.bincount(2 * group.reshape(-1) + swaps % 2, minlength=2 * len(first)).reshape(-1, 2)
     order = np.argsort(first)
     return every[first[order]], counts[order]
-
-
-def _as_vertices(vertices: ArrayLike) -> Float[np.ndarray, "n dim"]:
-    array = _as_array("vertices", vertices)
-    if array.dtype.kind not in "iuf":
-        raise InputError(f"vertices has type {array.dtype}; expected real numbers: positions in m")
-    if array.ndim != 2 or array.shape[1] not in (2, 3):
-        raise InputError(f"vertices has shape {list(array.shape)}; expected [n, 2] (plane) or [n, 3] (space)")
-    array = array.astype(np.float64)
-    if (bad := np.flatnonzero(~np.isfinite(array).all(axis=1))).size:
-        raise InputError(f"vertex {bad[0]} is at {array[bad[0]].tolist()}; expected finite numbers{_others(bad)}")
-    return array
-
-
-def _as_elements(elements: ArrayLike, dim: int) -> Int[np.ndarray, "m corners"]:
-    array = _as_array("elements", elements)
-    kind = WORDS[dim][0]
-    if array.ndim != 2 or array.shape[1] != dim + 1 or not array.shape[0]:
-        raise InputError(
-            f"elements has shape {list(array.shape)}; expected [m, {dim + 1}] with m >= 1, "
-            f"the corners of each {kind}, as vertices has {dim} columns"
-        )
-    if array.dtype.kind not in "iu":
-        raise InputError(f"elements has type {array.dtype}; expected integers: the indices of vertices")
-    return array.astype(np.int64)
 
 
 def _require_elements(vertices: np.ndarray, elements: np.ndarray) -> Float[np.ndarray, " m"]:

@@ -74,8 +74,16 @@ def fibres(
             f"groups are {group.dtype} of shape {list(group.shape)}; expected [{count}] integers from 0 on"
         )
     number = int(group.max()) + 1
+    ways = jnp.asarray(direction, dtype=float)
+    if ways.shape not in ((mesh.dimension,), (count, mesh.dimension)):
+        one = f"[{mesh.dimension}], or [{count}, {mesh.dimension}]: per element"
+        raise InputError(f"direction has shape {list(ways.shape)}; expected {one}")
+    if not isinstance(ways, Tracer):
+        lengths = np.atleast_1d(np.linalg.norm(np.asarray(ways), axis=-1))
+        if (wrong := ~(np.isfinite(lengths) & (lengths > 0))).any():
+            raise InputError(f"the direction of fibres {np.argmax(wrong)} has no length; expected a unit vector")
     parameters = Fibres(
-        _directions(direction, count, mesh.dimension),
+        ways,
         material("strength", strength, count, "element", NOT_NEGATIVE),
         None if activation is None else material("activation", activation, number, "group", NOT_NEGATIVE),
         None if stiffness is None else material("stiffness", stiffness, count, "element"),
@@ -111,16 +119,3 @@ def fibres(
     if mesh.midsides is None:
         return Term(name, nodes, energy, parameters, prepare, control=control, weights=shape_gradients, mesh=mesh)
     return Term(name, nodes, quadratic_energy, parameters, prepare, unrolled=False, control=control, mesh=mesh)
-
-
-def _directions(direction: Numbers, count: int, dimension: int) -> Float[Array, "*m dim"]:
-    result = jnp.asarray(direction, dtype=float)
-    if result.shape not in ((dimension,), (count, dimension)):
-        raise InputError(
-            f"direction has shape {list(result.shape)}; expected [{dimension}], or [{count}, {dimension}]: per element"
-        )
-    if not isinstance(result, Tracer):
-        lengths = np.atleast_1d(np.linalg.norm(np.asarray(result), axis=-1))
-        if (wrong := ~(np.isfinite(lengths) & (lengths > 0))).any():
-            raise InputError(f"the direction of fibres {np.argmax(wrong)} has no length; expected a unit vector")
-    return result
