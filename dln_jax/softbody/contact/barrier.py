@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from dln_jax.softbody.contact.distances import Stencil, closest, summed
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.terms.contact import Slip, friction_energy
-from dln_jax.softbody.terms.term import NOT_NEGATIVE, POSITIVE, Context, Numbers, material
+from dln_jax.softbody.terms.term import NOT_NEGATIVE, POSITIVE, Context, Numbers, Pose, material
 from dln_jax.solvers.elements.moving import Elements, MovingEnergy
 
 MOLLIFIED = 1e-3
@@ -37,6 +37,13 @@ class ContactParameters(NamedTuple):
     """kappa in Pa."""
     friction: Float[Array, ""] | None
     """Coulomb's coefficient, or `None`."""
+    shape: Any = None
+    """The obstacle; `None` between bodies."""
+
+    @property
+    def pose(self) -> Pose | None:
+        """Pose of the obstacle; `None` without friction."""
+        return None if self.friction is None or self.shape is None else self.shape.pose
 
 
 class Contact(NamedTuple):
@@ -75,12 +82,15 @@ class Pair(NamedTuple):
     """epsilon in m⁴ of two edges; zero for other pairs, which are not mollified."""
 
 
-def contact_parameters(distance: float, stiffness: Numbers, friction: Numbers | None) -> ContactParameters:
+def contact_parameters(
+    distance: float, stiffness: Numbers, friction: Numbers | None, shape: Any = None
+) -> ContactParameters:
     """Returns validated parameters."""
     return ContactParameters(
         jnp.asarray(distance, dtype=float),
         material("the stiffness of a contact", stiffness, 1, "contact", POSITIVE),
         None if friction is None else material("friction", friction, 1, "contact", NOT_NEGATIVE),
+        shape,
     )
 
 

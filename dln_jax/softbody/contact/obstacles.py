@@ -28,18 +28,6 @@ from dln_jax.solvers.elements.moving import Elements, MovingEnergy
 from dln_jax.types import InputError, require_positive
 
 
-class ObstacleParameters(NamedTuple):
-    """Parameters of the contact with an obstacle."""
-
-    contact: ContactParameters
-    shape: Any
-
-    @property
-    def pose(self) -> Pose | None:
-        """Pose of the shape; `None` without friction."""
-        return None if self.contact.friction is None else self.shape.pose
-
-
 class HalfSpace(NamedTuple):
     """The points below a plane."""
 
@@ -183,7 +171,7 @@ def obstacle_contact(
     if friction is not None and not hasattr(obstacle, "pose"):
         raise InputError(f"the obstacle '{name}' has no property `pose`, which friction needs")
     surface = surface_of(mesh)
-    parameters = ObstacleParameters(contact_parameters(distance, stiffness, friction), obstacle)
+    parameters = contact_parameters(distance, stiffness, friction, obstacle)
     distances = jax.vmap(type(obstacle).distance, (None, 0))
     inside = distances(obstacle, jnp.asarray(mesh.vertices[surface.vertices])) <= 0
     if inside.any():
@@ -195,12 +183,12 @@ def obstacle_contact(
     indices = jnp.asarray(surface.vertices)[:, None]
     every = Elements(indices, (), jnp.asarray(False))
 
-    def describe(x: Array, elements: Elements, data: tuple[ObstacleParameters, Array]) -> tuple[Any, Array, Array]:
+    def describe(x: Array, elements: Elements, data: tuple[ContactParameters, Array]) -> tuple[Any, Array, Array]:
         parameters, rest = data
-        strength = parameters.contact.stiffness / parameters.contact.distance**3 * areas(surface, rest)[0]
+        strength = parameters.stiffness / parameters.distance**3 * areas(surface, rest)[0]
         count = len(strength)
         repeated = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), parameters.shape)
-        return repeated, strength, jnp.broadcast_to(parameters.contact.distance**2, (count,))
+        return repeated, strength, jnp.broadcast_to(parameters.distance**2, (count,))
 
     def energy(x: Float[Array, "1 dim"], data: tuple[Any, Array, Array]) -> Float[Array, ""]:
         shape, strength, near = data
@@ -208,7 +196,7 @@ def obstacle_contact(
         # Inside the obstacle the energy is infinite, so that no step is accepted there.
         return jnp.where(d > 0, strength * barrier(d**2, near)[0], jnp.inf)
 
-    def longest(x: Array, step: Array, elements: Elements, data: tuple[ObstacleParameters, Array]) -> Array:
+    def longest(x: Array, step: Array, elements: Elements, data: tuple[ContactParameters, Array]) -> Array:
         def at(t: Array) -> Array:
             moved = x[surface.vertices] + t[:, None] * step[surface.vertices]
             return distances(data[0].shape, moved)
@@ -218,9 +206,9 @@ def obstacle_contact(
     def hessian(x: Array, data: Any) -> Array:
         return jax.hessian(energy)(x, data).reshape(x.size, x.size)
 
-    def prepare(parameters: ObstacleParameters, context: Context) -> tuple[Any, ...]:
+    def prepare(parameters: ContactParameters, context: Context) -> tuple[Any, ...]:
         data = (parameters, context.rest)
-        if parameters.contact.friction is None:
+        if parameters.friction is None:
             return (data,)
         x, lagged = (at[surface.vertices] for at in (context.x, context.x if context.lag is None else context.lag))
         d, slope = jax.vmap(jax.value_and_grad(parameters.shape.distance))(lagged)
@@ -228,14 +216,14 @@ def obstacle_contact(
         _, strength, near = describe(context.x, every, data)
         force = -2 * d * strength * barrier(d**2, near)[1] * steep
         carried = x + motion_of(name, parameters, context.before, x)
-        largest = parameters.contact.friction * force
+        largest = parameters.friction * force
         slip = slip_of(context, threshold_speed, carried, slope / steep[:, None], largest)
         return data, (every, (slip, jnp.ones((len(x), 1), x.dtype)))
 
     pushing = MovingEnergy(lambda *_: every, describe, jax.value_and_grad(energy), hessian, longest)
 
-    def least_distance(x: Array, elements: Elements, data: tuple[ObstacleParameters, Array]) -> Array:
-        return jnp.minimum(jnp.min(distances(data[0].shape, x[surface.vertices])), data[0].contact.distance)
+    def least_distance(x: Array, elements: Elements, data: tuple[ContactParameters, Array]) -> Array:
+        return jnp.minimum(jnp.min(distances(data[0].shape, x[surface.vertices])), data[0].distance)
 
     energies = (pushing,) if friction is None else (pushing, SLIDING)
     return Contact(name, parameters, energies, prepare, least_distance, mesh, changing=False)

@@ -141,8 +141,8 @@ def test_derivatives_through_iterated_friction_with_a_moving_obstacle_agree_with
     ground = scene.params.terms["ground"]
 
     def outcome(values):
-        near = ground.contact._replace(stiffness=values[1], friction=values[2])
-        moved = {"contact": near, "shape": ground.shape._replace(offset=values[3])}
+        shape = ground.shape._replace(offset=values[3])
+        moved = {"stiffness": values[1], "friction": values[2], "shape": shape}
         params = with_parameters(scene.params, elastic={"youngs_modulus": values[0]}, ground=moved)
         state, info = jax.lax.scan(lambda state, _: step(params, state), init(v=[2.0, -1.0]), None, length=6)
         return jnp.sum(state.x[:, 0] ** 2) + jnp.sum(state.v[:, 1]), info.converged
