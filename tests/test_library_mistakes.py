@@ -22,7 +22,7 @@ from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.pendulums import two_link_arm
 from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.scene import make_scene, with_parameters
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.types import InputError, Needs
 
 ARM = Needs(joints=("revolute", "prismatic"))

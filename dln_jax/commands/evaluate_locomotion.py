@@ -37,7 +37,7 @@ class Arguments(Folder):
 def main(options: Arguments) -> None:
     """Evaluates the policy, prints and writes the numbers."""
     from dln_jax.commands.locomotion import judge, load_policy
-    from dln_jax.locomotion.perturbed import numbers_of, perturbed_trials
+    from dln_jax.locomotion.learning import numbers_of, perturbed_trials
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.report import Report, finish, rows_of
     from dln_jax.types import require_positive, require_seed

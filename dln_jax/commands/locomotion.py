@@ -14,11 +14,12 @@ from dln_jax.figures import style
 from dln_jax.figures.animations import write_gif
 from dln_jax.figures.soft_bodies import soft_body_drawing
 from dln_jax.files import as_type
-from dln_jax.locomotion.learning import GOAL, Parameters, Policy, Record, make_policy
-from dln_jax.locomotion.perturbed import STEPS, Trials
-from dln_jax.locomotion.task import LocomotionTask, Walk, beginning, creature_named, make_task
+from dln_jax.locomotion.gradient import Parameters, Policy, make_policy
+from dln_jax.locomotion.learning import GOAL, STEPS, Record, Trials
+from dln_jax.locomotion.task import LocomotionTask, Walk, beginning, make_task
 from dln_jax.locomotion.worlds import Variation
 from dln_jax.metrics.verdict import Verdict
+from dln_jax.softbody.mesh.shapes import creature_named
 from dln_jax.softbody.terms.creature import ground_height
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import MODEL, REMEDY, load_manifest, load_tree

@@ -66,23 +66,32 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
     import numpy as np
 
     from dln_jax.commands.locomotion import NAME, SHOWN, judge, learning_figure, load_policy, write_gait
-    from dln_jax.locomotion.gradient import GradientSettings, shown_walk, train
-    from dln_jax.locomotion.learning import GOAL, LANES, Goal, Record, evaluation_steps, median_to_reach
-    from dln_jax.locomotion.perturbed import numbers_of, perturbed_trials
-    from dln_jax.locomotion.task import CLOCK_PERIOD, creature_named, make_task
+    from dln_jax.locomotion.gradient import LANES, GradientSettings, make_policy, shown_walk
+    from dln_jax.locomotion.learning import (
+        GOAL,
+        Record,
+        evaluation_steps,
+        median_to_reach,
+        numbers_of,
+        perturbed_trials,
+        rank,
+        train,
+    )
+    from dln_jax.locomotion.task import CLOCK_PERIOD, make_task
     from dln_jax.locomotion.worlds import Variation
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import Report, finish, png, rows_of
     from dln_jax.runs.scaled import mesh_of
     from dln_jax.scale import device_lines, shares
+    from dln_jax.softbody.mesh.shapes import creature_named
     from dln_jax.softbody.terms.creature import TIME_STEP
     from dln_jax.types import require_positive, require_seed
     from dln_jax.zoo.parameter_files import save_tree
     from dln_jax.zoo.run import MODEL
 
-    mesh, settings = mesh_of(options), GradientSettings(window=options.window, lanes=lanes)
-    require_positive(seeds=options.seeds, width=options.width, episode=options.episode, **settings._asdict())
+    mesh, settings = mesh_of(options), GradientSettings(options.width, options.window, lanes)
+    require_positive(seeds=options.seeds, episode=options.episode, **settings._asdict())
     require_positive_if_given(options, ["steps", "until"])
     require_seed(options.seed, options.seeds)
     for name in ("upright", "speed"):
@@ -116,11 +125,11 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
                 succeeded = f"{at.succeeded:.0%} of starts succeed{skipped}"
                 show(done, f"gradient, seed {seed}: {at.distance:.3f} body lengths, {succeeded}")
 
-            policies = train(
+            trained = train(
                 task,
                 seeds=range(options.seed, options.seed + options.seeds),
-                goal=Goal(steps, options.until or math.inf),
-                width=options.width,
+                steps=steps,
+                until=options.until or math.inf,
                 settings=settings,
                 initial=None if stored is None else stored.parameters,
                 directory=folder,
@@ -128,21 +137,22 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
                 mesh=mesh,
                 report=report,
             )
-        best = policies.best
+        best = max(trained, key=lambda seed: rank(seed.selected))
         if not math.isfinite(best.distance):
             raise InputError(
                 f"no evaluation converged; {folder} holds no model: lower the number of steps or the width"
             )
         facts = {"name": NAME, "creature": task.creature.name, "precision": "f64", "clock_period": task.clock_period}
-        facts |= {"variation": task.variation._asdict(), "settings": {"width": options.width, **settings._asdict()}}
+        facts |= {"variation": task.variation._asdict(), "settings": settings._asdict()}
         save_tree(folder, MODEL, best.parameters, {"model": facts})
         start = SHOWN if task.variation.rough else None
-        seen = shown_walk(task, policies.policy, best.parameters, task.episode, start)
-        curves = [seed.records for seed in policies.learned]
+        policy = make_policy(task, width=options.width)
+        seen = shown_walk(task, policy, best.parameters, task.episode, start)
+        curves = [seed.records for seed in trained]
         heights = seen.x[:, :, -1].mean(axis=1) / task.creature.mesh.vertices[:, -1].mean()
         metrics = {
             "distance_body_lengths": best.distance,
-            "distance_body_lengths_median": np.median([float(seed.distance) for seed in policies.learned]),
+            "distance_body_lengths_median": np.median([float(seed.distance) for seed in trained]),
             "environment_steps": best.records[-1].steps,
             "evaluation_steps": len(best.records) * evaluation_steps(task),
             "environment_steps_to_five_body_lengths": median_to_reach(curves, GOAL, "steps"),
@@ -155,7 +165,7 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
         }
         metrics, lines = {name: float(value) for name, value in metrics.items() if math.isfinite(value)}, ()
         if any(task.variation):
-            trials = perturbed_trials(task, policies.policy, best.parameters)
+            trials = perturbed_trials(task, policy, best.parameters)
             verdict = judge(trials)
             metrics |= {**numbers_of(trials), "verdict": float(verdict.number)}
             lines = (verdict.line,)

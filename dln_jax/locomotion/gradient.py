@@ -1,12 +1,16 @@
 """Learns to move by short-horizon gradients through the simulator, with a learned value at the end of the horizon.
 
+    command = tanh(W3 tanh(W1 body + W2 clock + b1) + b3)
+    change of the actuation = 0.3 tanh((0.625 + 0.375 command - actuation) / 0.3)
+
     J(theta) = E[ sum over t < H of gamma^t r_t  +  gamma^H V(o_H) ]  under theta + s eps,    eps ~ N(0, I)
 
-Lanes come in pairs, +eps and -eps. Every lane walks H steps from the end of its last window, for episodes of any
-length. Gradients go back to the beginning of the window and no further, so they neither explode nor vanish over an
-episode; V stands for all later rewards (Xu et al. 2022, "Accelerated policy learning with parallel differentiable
-simulation"). After a fall, the window's later rewards and value are zero, and the lane begins a new episode with a
-start of its own. V is fitted to TD(lambda) targets, made by a copy V' that follows it slowly:
+The policy's layers start with variances 0.3, 1 and 0.1 over their fan-in: at first the muscles move little. Lanes come
+in pairs, +eps and -eps. Every lane walks H steps from the end of its last window, for episodes of any length. Gradients
+go back to the beginning of the window and no further, so they neither explode nor vanish over an episode; V stands for
+all later rewards (Xu et al. 2022, "Accelerated policy learning with parallel differentiable simulation"). After a fall,
+the window's later rewards and value are zero, and the lane begins a new episode with a start of its own. V is fitted to
+TD(lambda) targets, made by a copy V' that follows it slowly:
 
     G_t = r_t + gamma ((1 - lambda) V'(o_t+1) + lambda G_t+1),    G_H = V'(o_H)
 
@@ -15,44 +19,56 @@ it does not depend on their assignment to devices. The learning rate follows a c
 evaluated and kept has running averages of the parameters, because single updates throw a gait off balance and back.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
+import haiku as hk
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.sharding import Mesh
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
-from dln_jax.locomotion.learning import (
-    LANES,
-    WIDTH,
-    CompiledLearner,
-    Goal,
-    Learned,
-    Learner,
-    Parameters,
-    Policy,
-    Record,
-    compile_learner,
-    learn,
-    make_policy,
-    rank,
+from dln_jax.errors import require_network
+from dln_jax.locomotion.task import (
+    EpisodeState,
+    LocomotionTask,
+    Walk,
+    actuation_seen,
+    advance,
+    beginning,
+    change_of,
+    chosen,
+    observe,
+    walk,
 )
-from dln_jax.locomotion.task import EpisodeState, LocomotionTask, Walk, advance, beginning, chosen, observe, walk
-from dln_jax.locomotion.value import Window, make_value, targets
 from dln_jax.scale import shares, spread
 from dln_jax.types import InputError, require_positive
 
-Report = Callable[[int, Record], None]
+WIDTH = 64
+"""Number of hidden units of the policy, and of the two hidden layers of the value."""
+LANES = "creatures side by side"
+"""Name of the items that devices share, for messages."""
+
+Parameters = Any
+
+
+class Policy(NamedTuple):
+    """Policy as an (init, apply) pair."""
+
+    init: Callable[[Array], Parameters]
+    """Random key -> parameters."""
+    apply: Callable[[Parameters, Float[Array, " o"]], Float[Array, " k"]]
+    """Observation -> change of the actuation."""
 
 
 class GradientSettings(NamedTuple):
-    """Settings of gradients and optimiser, the same for all creatures."""
+    """Settings of the policy, gradients and optimiser, the same for all creatures."""
 
+    width: int = WIDTH
+    """Width of the policy's hidden layer."""
     window: int = 32
     """H, number of steps that gradients go back."""
     lanes: int = 4
@@ -80,13 +96,17 @@ class GradientSettings(NamedTuple):
     varied_updates: int = 100
     """Updates between two evaluations by several starts, which take longer."""
 
+    def updates_of(self, task: LocomotionTask) -> int:
+        """Returns the number of updates between two evaluations."""
+        return self.varied_updates if any(task.variation) else self.updates
+
 
 class GradientState(NamedTuple):
     """State of the training."""
 
     parameters: Parameters
     averaged: Parameters
-    """Running averages of the parameters."""
+    """Running averages of the parameters: the policy that is evaluated."""
     optimiser: Any
     value: Parameters
     value_optimiser: Any
@@ -96,77 +116,40 @@ class GradientState(NamedTuple):
     seed: Int[Array, ""]
     updates: Int[Array, ""]
     skipped: Int[Array, ""]
+    """Number of updates in which a step of the simulator did not converge."""
 
 
-class TrainedPolicies(NamedTuple):
-    """Policies of several seeds."""
+def make_policy(task: LocomotionTask, *, width: int = WIDTH) -> Policy:
+    """Returns the policy of a task."""
+    require_network(width=width, depth=1)
 
-    policy: Policy
-    learned: list[Learned]
+    def network(observation: Float[Array, " o"]) -> Float[Array, " k"]:
+        scaled, split = hk.initializers.VarianceScaling, len(observation) - task.clock_size
+        hidden = hk.Linear(width, w_init=scaled(0.3), name="body")(observation[:split])
+        if task.clock_size:
+            hidden += hk.Linear(width, with_bias=False, w_init=scaled(1.0), name="clock")(observation[split:])
+        muscles = hk.Linear(task.muscle_count, w_init=scaled(0.1), name="muscles")
+        return change_of(actuation_seen(task, observation), jnp.tanh(muscles(jnp.tanh(hidden))))
 
-    @property
-    def best(self) -> Learned:
-        """The seed whose selected policy has the best evaluation."""
-        return max(self.learned, key=lambda seed: rank(seed.selected))
-
-
-def train(
-    task: LocomotionTask,
-    *,
-    seeds: Sequence[int],
-    goal: Goal,
-    width: int = WIDTH,
-    settings: GradientSettings = GradientSettings(),  # noqa: B008
-    initial: Parameters | None = None,
-    directory: Path | None = None,
-    resume: bool = False,
-    mesh: Mesh | None = None,
-    report: Report = lambda seed, record: None,
-) -> TrainedPolicies:
-    """Trains with several seeds; settings are the same for all seeds and creatures.
-
-    Args:
-        seeds: seeds, trained one after the other; programs are compiled once.
-        goal: conditions that end the training of a seed.
-        width: width of the policy's hidden layer.
-        settings: settings of the learner.
-        initial: parameters of a policy of this width to train further (default: random).
-        directory: folder where states are stored.
-        resume: continue the runs stored there.
-        mesh: devices that share the creatures simulated side by side.
-        report: called with seed and record after every evaluation.
-
-    Raises:
-        InputError: settings are out of range, a stored run has others, or the mesh does not divide the creatures.
-    """
-    policy = make_policy(task, width=width)
-    if initial is not None:
-        policy = policy._replace(init=lambda _: initial)
-    learner = make_gradient_learner(task, policy, settings, steps=goal.steps, mesh=mesh)
-    facts = {"creature": task.creature.name, "width": width, "episode": task.episode, "steps": goal.steps}
-    facts |= {"upright": task.upright, "speed": task.speed, "clock_period": task.clock_period}
-    facts |= {**task.variation._asdict(), **settings._asdict()}
-    compiled = compile_learner(task, learner, mesh)
-    return learn_seeds(compiled, seeds, goal, report, directory=directory, settings=facts, resume=resume)
+    transformed = hk.without_apply_rng(hk.transform(network))
+    return Policy(lambda key: transformed.init(key, observe(task, beginning(task))), transformed.apply)
 
 
-def learn_seeds(
-    compiled: CompiledLearner, seeds: Sequence[int], goal: Goal, report: Report, **stored: Any
-) -> TrainedPolicies:
-    """Trains with several seeds by one compiled learner; `stored` are arguments of `learn` for checkpoints."""
-    one = partial(learn, compiled, goal=goal, **stored)
-    return TrainedPolicies(compiled.learner.policy, [one(seed=seed, report=partial(report, seed)) for seed in seeds])
+def shown_walk(
+    task: LocomotionTask, policy: Policy, parameters: Parameters, steps: int, seed: int | None = None
+) -> Walk:
+    """Runs a policy from rest, or from a start drawn by a seed, and returns its steps as NumPy arrays."""
+    start = beginning(task, None if seed is None else jax.random.key(seed))
+    program = jax.jit(lambda p: walk(task, lambda seen: policy.apply(p, seen), start, steps)[1])
+    return jax.tree.map(np.asarray, program(parameters))
 
 
-def make_gradient_learner(
-    task: LocomotionTask,
-    policy: Policy,
-    settings: GradientSettings = GradientSettings(),  # noqa: B008
-    *,
-    steps: int,
-    mesh: Mesh | None = None,
-) -> Learner:
-    """Returns the learner, whose learning rate falls over `steps` environment steps.
+def make_updates(
+    task: LocomotionTask, policy: Policy, settings: GradientSettings, *, steps: int, mesh: Mesh | None = None
+) -> tuple[Callable[[int], GradientState], Callable[[GradientState], GradientState]]:
+    """Returns seed -> state, and state -> state after the updates between two evaluations.
+
+    The learning rate falls over `steps` environment steps.
 
     Raises:
         InputError: settings are out of range, or the mesh does not divide the lanes.
@@ -180,15 +163,30 @@ def make_gradient_learner(
     in_all = max(1, steps // (lanes * window))
     rate = optax.cosine_decay_schedule(settings.learning_rate, in_all, settings.last_rate)
     optimiser = optax.adam(rate, b1=0.7, b2=0.95)
-    value_init, value_of = make_value(task.observation_size)
     value_optimiser = optax.adam(settings.value_learning_rate)
 
+    def value_network(seen: Float[Array, " o"]) -> Float[Array, ""]:
+        return hk.nets.MLP([WIDTH, WIDTH, 1], activation=jnp.tanh, name="value")(seen)[0]
+
+    value_init, value_of = hk.without_apply_rng(hk.transform(value_network))
+
     def start(seed: int) -> GradientState:
-        parameters, value = policy.init(jax.random.key(seed)), value_init(jax.random.fold_in(jax.random.key(seed), 1))
-        places = jax.vmap(lambda key: beginning(task, key))(jax.random.split(jax.random.key(seed), lanes))
-        moments, zero = (optimiser.init(parameters), value_optimiser.init(value)), jnp.asarray(0)
-        own = parameters, parameters, moments[0], value, moments[1], value, places
-        return GradientState(*own, jnp.asarray(seed), zero, zero)
+        key, zero = jax.random.key(seed), jnp.asarray(0)
+        parameters = policy.init(key)
+        value = value_init(jax.random.fold_in(key, 1), jnp.zeros(task.observation_size))
+        places = jax.vmap(lambda key: beginning(task, key))(jax.random.split(key, lanes))
+        return GradientState(
+            parameters,
+            parameters,
+            optimiser.init(parameters),
+            value,
+            value_optimiser.init(value),
+            value,
+            places,
+            jnp.asarray(seed),
+            zero,
+            zero,
+        )
 
     def loss(parameters: Parameters, value: Parameters, noise: Parameters, place: EpisodeState) -> tuple[Array, Any]:
         own = jax.tree.map(lambda p, eps: p + settings.deviation * eps, parameters, noise)
@@ -205,26 +203,25 @@ def make_gradient_learner(
         weights = discount ** jnp.arange(window)
         later = jnp.where(alive > 0, discount**window * value_of(value, last), 0.0)
         total = jnp.sum(weights * jnp.where(lived > 0, rewards, 0.0)) + later
-        records = Window(jnp.concatenate([seen, last[None]]), rewards, jnp.append(lived, alive))
+        records = jnp.concatenate([seen, last[None]]), rewards, jnp.append(lived, alive)
         return -total, (end, records, converged.all())
 
     def descent(shared: tuple[Parameters, Parameters], own: tuple[Parameters, EpisodeState]) -> tuple[Any, Any]:
-        gradient, (end, records, converged) = jax.grad(loss, has_aux=True)(*shared, *own)
+        gradient, (end, (seen, rewards, alive), converged) = jax.grad(loss, has_aux=True)(*shared, *own)
         finite = jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient)]).all() & converged
-        gradient, _ = clipped.update(
-            jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), gradient), optax.EmptyState()
+        gradient, seen, rewards, alive = jax.tree.map(
+            lambda leaf: jnp.where(finite, leaf, 0.0), (gradient, seen, rewards, alive)
         )
-        records = records._replace(alive=jnp.where(finite, records.alive, 0.0))
-        return (gradient, finite), (end, jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), records))
+        return (clipped.update(gradient, optax.EmptyState())[0], finite), (end, seen, rewards, alive)
 
     descents = spread(lambda shared, own: jax.vmap(partial(descent, shared))(own), mesh)
 
     def update(state: GradientState, _: None) -> tuple[GradientState, None]:
         key = jax.random.fold_in(jax.random.key(state.seed), state.updates)
         for_noise, for_starts = jax.random.split(key)
-        shared = state.parameters, state.followed
-        (gradients, finite), (ends, records) = descents(
-            shared, (_opposite_pairs(for_noise, state.parameters, lanes), state.lanes)
+        noise = _opposite_pairs(for_noise, state.parameters, lanes)
+        (gradients, finite), (ends, seen, rewards, alive) = descents(
+            (state.parameters, state.followed), (noise, state.lanes)
         )
         gradient = jax.tree.map(lambda of_lanes: of_lanes.sum(axis=0) / jnp.maximum(finite.sum(), 1), gradients)
         change, moments = optimiser.update(gradient, state.optimiser, state.parameters)
@@ -234,12 +231,12 @@ def make_gradient_learner(
         kept = jnp.minimum(settings.average, (1.0 + state.updates) / (10.0 + state.updates))
         averaged = optax.incremental_update(parameters, state.averaged, 1.0 - kept)
 
-        values = jax.vmap(jax.vmap(partial(value_of, state.followed)))(records.seen)
-        aims = jax.vmap(partial(targets, discount=discount, trace=settings.trace))(records, values)
-        counted = records.alive[:, :-1]
+        values = jax.vmap(jax.vmap(partial(value_of, state.followed)))(seen)
+        aims = jax.vmap(partial(targets, discount=discount, trace=settings.trace))(rewards, alive, values)
+        counted = alive[:, :-1]
 
         def misfit(value: Parameters) -> Array:
-            off = jax.vmap(jax.vmap(partial(value_of, value)))(records.seen[:, :-1]) - aims
+            off = jax.vmap(jax.vmap(partial(value_of, value)))(seen[:, :-1]) - aims
             return jnp.sum(counted * off**2) / jnp.maximum(counted.sum(), 1.0)
 
         def fit(fitted: tuple[Parameters, Any], _: None) -> tuple[tuple[Parameters, Any], None]:
@@ -250,21 +247,32 @@ def make_gradient_learner(
         fitted = (state.value, state.value_optimiser)
         (value, value_moments), _ = jax.lax.scan(fit, fitted, length=settings.value_fits)
         followed = optax.incremental_update(value, state.followed, settings.following)
-        over = (ends.steps >= task.episode) | (records.alive[:, -1] == 0)
+        over = (ends.steps >= task.episode) | (alive[:, -1] == 0)
         starts = jax.vmap(lambda key: beginning(task, key))(jax.random.split(for_starts, lanes))
         places = jax.vmap(chosen)(over, starts, ends)
         skipped = state.skipped + (~finite.all()).astype(state.skipped.dtype)
         learned = parameters, averaged, moments, value, value_moments, followed, places
         return GradientState(*learned, state.seed, state.updates + 1, skipped), None
 
-    updates = settings.varied_updates if any(task.variation) else settings.updates
-    return Learner(
-        policy=policy,
-        start=start,
-        improve=lambda state: jax.lax.scan(update, state, length=updates)[0],
-        parameters=lambda state: state.averaged,
-        steps=updates * lanes * window,
-    )
+    return start, lambda state: jax.lax.scan(update, state, length=settings.updates_of(task))[0]
+
+
+def targets(
+    rewards: Float[Array, " H"],
+    alive: Float[Array, " H_plus_1"],
+    values: Float[Array, " H_plus_1"],
+    discount: float,
+    trace: float,
+) -> Float[Array, " H"]:
+    """Returns TD(lambda) targets G_t of a window; `values` are V' of its observations; alive is 1 before a fall."""
+    values = alive * values
+
+    def back(later: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:
+        reward, value = at
+        target = reward + discount * ((1 - trace) * value + trace * later)
+        return target, target
+
+    return jax.lax.scan(back, values[-1], (alive[:-1] * rewards, values[1:]), reverse=True)[1]
 
 
 def _opposite_pairs(key: Array, parameters: Parameters, lanes: int) -> Parameters:
@@ -273,12 +281,3 @@ def _opposite_pairs(key: Array, parameters: Parameters, lanes: int) -> Parameter
     keys = jax.random.split(key, len(leaves))
     halves = [jax.random.normal(k, (lanes // 2, *leaf.shape), leaf.dtype) for k, leaf in zip(keys, leaves, strict=True)]
     return structure.unflatten([jnp.concatenate([half, -half]) for half in halves])
-
-
-def shown_walk(
-    task: LocomotionTask, policy: Policy, parameters: Parameters, steps: int, seed: int | None = None
-) -> Walk:
-    """Runs a policy from rest, or from a start drawn by a seed, and returns its steps as NumPy arrays."""
-    start = beginning(task, None if seed is None else jax.random.key(seed))
-    program = jax.jit(lambda p: walk(task, lambda seen: policy.apply(p, seen), start, steps)[1])
-    return jax.tree.map(np.asarray, program(parameters))

@@ -1,69 +1,46 @@
-"""A policy, and the loop that trains it: update, evaluate, record, until a distance or a number of environment steps.
+"""The loop that trains policies: update, evaluate, record, until a distance or a number of environment steps.
 
-    command = tanh(W3 tanh(W1 body + W2 clock + b1) + b3)
-    change of the actuation = 0.3 tanh((0.625 + 0.375 command - actuation) / 0.3)
-
-Layers start with variances 0.3, 1 and 0.1 over their fan-in: at first the muscles move little. An environment step is
-one step of the simulator for one creature. After every call of `improve` the policy is evaluated by one episode from
-rest or, if the task varies, by several starts on the steepest slopes that walk for the length of several episodes,
-because falls are rare. Steps of evaluations are counted separately. The policy that is kept is the one with the most
-successful starts, and among those the one that goes farthest.
+An environment step is one step of the simulator for one creature. After some updates the policy is evaluated by one
+episode from rest or, if the task varies, by several starts on the steepest slopes that walk for the length of several
+episodes, because falls are rare. Steps of evaluations are counted separately. The policy that is kept is the one with
+the most successful starts, and among those the one that goes farthest.
 """
 
 import math
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import haiku as hk
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from dln_jax.errors import require_network
 from dln_jax.files import finite as finite_values
 from dln_jax.learning.engine.checkpoint import has_checkpoint, stored_rows
-from dln_jax.locomotion.task import (
-    EpisodeState,
-    LocomotionTask,
-    actuation_seen,
-    beginning,
-    change_of,
-    observe,
-    run_episode,
-)
+from dln_jax.locomotion.gradient import GradientSettings, GradientState, Parameters, Policy, make_policy, make_updates
+from dln_jax.locomotion.task import EpisodeState, LocomotionTask, beginning, run_episode
 from dln_jax.precision import quick_compilation
 from dln_jax.process import held_back
 from dln_jax.scale import local, program, spread
 from dln_jax.types import InputError
 from dln_jax.zoo import parameter_files as checkpoints
 
-WIDTH = 64
-"""Number of hidden units of the policy."""
 VALIDATION = 2_000_000
-"""Seed of the starts for selecting a policy; neither training nor `perturbed` draws them."""
+"""Seed of the starts for selecting a policy; neither training nor `perturbed_trials` draws them."""
 VALIDATION_STARTS, VALIDATION_EPISODES = 16, 5
 """Number of starts, and length of their walks in episodes."""
+STARTS, STEPS = 100, 2000
+"""Number of episodes, and steps of each, by which a policy is judged."""
+AT_ONCE = 25
+"""Number of these episodes side by side."""
+SEED = 1_000_000
+"""Seed of their starts, which training does not draw."""
 CHECKPOINT = "checkpoint"
 """Prefix of the checkpoint files of a seed."""
-LANES = "creatures side by side"
-"""Name of the items that devices share, for messages."""
-
-Parameters = Any
-
-
-class Policy(NamedTuple):
-    """Policy as an (init, apply) pair."""
-
-    init: Callable[[Array], Parameters]
-    """Random key -> parameters."""
-    apply: Callable[[Parameters, Float[Array, " o"]], Float[Array, " k"]]
-    """Observation -> change of the actuation."""
-
-
 GOAL = 5.0
 """The effort of learning is measured up to this distance, in body lengths."""
 
@@ -83,47 +60,20 @@ class Record(NamedTuple):
     """Share of starts that end without a fall and at least a body length ahead."""
 
 
-def median_to_reach(seeds: Sequence[Sequence[Record]], distance: float, field: str) -> float:
-    """Median over seeds of the "steps" or "seconds" to the distance; infinite if at least half never reached it."""
-    reached = [
-        next((getattr(record, field) for record in records if record.distance >= distance), math.inf)
-        for records in seeds
-    ]
-    return float(np.median(reached))
-
-
-def rank(record: Record | None) -> tuple[float, float]:
-    """Returns the key for comparing evaluations: successful starts, then distance."""
-    if record is None or not math.isfinite(record.distance):
-        return -math.inf, -math.inf
-    return record.succeeded, record.distance
-
-
 class Learner(NamedTuple):
-    """A method of training a policy."""
+    """Compiled programs that train a policy, for any number of seeds."""
 
-    policy: Policy
-    start: Callable[[int], Any]
-    """Seed -> state, a tree of arrays; any object if it is never stored."""
-    improve: Callable[[Any], Any]
-    """State -> state after some updates; traceable for trees."""
-    parameters: Callable[[Any], Parameters]
-    """State -> parameters of the policy."""
+    start: Callable[[int], GradientState]
+    """Seed -> state."""
+    improve: Callable[[GradientState], GradientState]
+    """State -> state after some updates."""
+    evaluate: Callable[[Parameters], Any]
+    """Parameters -> `distance` and `succeeded` of a `Record`."""
     steps: int
     """Environment steps per call of `improve`."""
-    skipped: Callable[[Any], Any] = lambda state: state.skipped
-    """State -> number of skipped updates."""
-
-
-class CompiledLearner(NamedTuple):
-    """A learner with its compiled programs, for any number of seeds."""
-
-    learner: Learner
-    improve: Callable[[Any], Any]
-    evaluate: Callable[[Parameters], Any]
     seconds: float
     """Compilation time."""
-    mesh: Mesh | None = None
+    mesh: Mesh | None
     """Devices that run the programs."""
 
 
@@ -146,65 +96,95 @@ class Learned(NamedTuple):
         return math.nan if self.selected is None else self.selected.distance
 
 
-class Goal(NamedTuple):
-    """Conditions that end training."""
-
-    steps: int
-    """Environment steps; the last update may exceed it."""
-    distance: float = math.inf
-    """Body lengths."""
+def rank(record: Record | None) -> tuple[float, float]:
+    """Returns the key for comparing evaluations: successful starts, then distance."""
+    if record is None or not math.isfinite(record.distance):
+        return -math.inf, -math.inf
+    return record.succeeded, record.distance
 
 
-def make_policy(task: LocomotionTask, *, width: int = WIDTH) -> Policy:
-    """Returns the policy of a task."""
-    require_network(width=width, depth=1)
-
-    def network(observation: Float[Array, " o"]) -> Float[Array, " k"]:
-        scaled, split = hk.initializers.VarianceScaling, len(observation) - task.clock_size
-        hidden = hk.Linear(width, w_init=scaled(0.3), name="body")(observation[:split])
-        if task.clock_size:
-            hidden += hk.Linear(width, with_bias=False, w_init=scaled(1.0), name="clock")(observation[split:])
-        muscles = hk.Linear(task.muscle_count, w_init=scaled(0.1), name="muscles")
-        return change_of(actuation_seen(task, observation), jnp.tanh(muscles(jnp.tanh(hidden))))
-
-    transformed = hk.without_apply_rng(hk.transform(network))
-    return Policy(lambda key: transformed.init(key, observe(task, beginning(task))), transformed.apply)
+def median_to_reach(seeds: Sequence[Sequence[Record]], distance: float, field: str) -> float:
+    """Median over seeds of the "steps" or "seconds" to the distance; infinite if at least half never reached it."""
+    reached = [
+        next((getattr(record, field) for record in records if record.distance >= distance), math.inf)
+        for records in seeds
+    ]
+    return float(np.median(reached))
 
 
-def compile_learner(task: LocomotionTask, learner: Learner, mesh: Mesh | None = None) -> CompiledLearner:
-    """Compiles a learner's programs, for the mesh that it was built for."""
-    began = time.perf_counter()
-    state = jax.eval_shape(lambda: learner.start(0))
-    improve = program(learner.improve, mesh).lower(state).compile(quick_compilation())
-    evaluate = compile_evaluation(task, learner.policy, jax.eval_shape(learner.parameters, state), mesh)
-    return CompiledLearner(learner, improve, evaluate, time.perf_counter() - began, mesh)
+def train(
+    task: LocomotionTask,
+    *,
+    seeds: Sequence[int],
+    steps: int,
+    until: float = math.inf,
+    settings: GradientSettings = GradientSettings(),  # noqa: B008
+    initial: Parameters | None = None,
+    directory: Path | None = None,
+    resume: bool = False,
+    mesh: Mesh | None = None,
+    report: Callable[[int, Record], None] = lambda seed, record: None,
+) -> list[Learned]:
+    """Trains with several seeds, one after the other; programs are compiled once.
 
+    Args:
+        steps: environment steps of a seed; the last update may exceed them.
+        until: distance in body lengths at which the training of a seed ends.
+        initial: parameters of a policy of the settings' width to train further (default: random).
+        directory: folder where states are stored.
+        resume: continue the runs stored there.
+        mesh: devices that share the creatures simulated side by side.
+        report: called with seed and record after every evaluation.
 
-def compile_evaluation(
-    task: LocomotionTask, policy: Policy, parameters: Parameters, mesh: Mesh | None = None
-) -> Callable[[Parameters], Any]:
-    """Returns parameters -> `distance` and `succeeded` of a `Record`, by an episode from rest or several varied starts.
-
-    A start with a step that does not converge counts 0. Every device walks, and the first device's result counts.
+    Raises:
+        InputError: settings are out of range, a stored run has others, or the mesh does not divide the creatures.
     """
+    policy = make_policy(task, width=settings.width)
+    if initial is not None:
+        policy = policy._replace(init=lambda _: initial)
+    learner = make_learner(task, policy, settings, steps=steps, mesh=mesh)
+    facts = {"creature": task.creature.name, "episode": task.episode, "steps": steps}
+    facts |= {"upright": task.upright, "speed": task.speed, "clock_period": task.clock_period}
+    facts |= {**task.variation._asdict(), **settings._asdict()}
+    one = partial(learn, learner, steps=steps, until=until, directory=directory, settings=facts, resume=resume)
+    return [one(seed=seed, report=partial(report, seed)) for seed in seeds]
+
+
+def make_learner(
+    task: LocomotionTask,
+    policy: Policy,
+    settings: GradientSettings = GradientSettings(),  # noqa: B008
+    *,
+    steps: int,
+    mesh: Mesh | None = None,
+) -> Learner:
+    """Compiles the programs that train a policy for `steps` environment steps; errors are those of `make_updates`."""
+    start, improve = make_updates(task, policy, settings, steps=steps, mesh=mesh)
+    began = time.perf_counter()
+    state = jax.eval_shape(lambda: start(0))
+    improved = program(improve, mesh).lower(state).compile(quick_compilation())
     starts, episodes = (VALIDATION_STARTS, VALIDATION_EPISODES) if any(task.variation) else (1, 1)
     longer = task._replace(episode=episodes * task.episode)
 
     def evaluated(parameters: Parameters, ones: Float[Array, "1 1"]) -> Float[Array, "1 2"]:
         def walked(start: EpisodeState | None) -> Float[Array, " 2"]:
-            walk = run_episode(longer, lambda observation: policy.apply(parameters, observation), start)
-            succeeded = (walk.steps >= longer.episode) & (walk.distance >= 1.0)
-            return jnp.stack([walk.distance / episodes, succeeded.astype(walk.distance.dtype)])
+            distance, standing = run_episode(longer, partial(policy.apply, parameters), start)
+            succeeded = (standing >= longer.episode) & (distance >= 1.0)
+            return jnp.stack([distance / episodes, succeeded.astype(distance.dtype)])
 
         if starts == 1:
             return ones * walked(None)
         keys = jax.random.split(jax.random.key(VALIDATION), starts)
         results = jax.vmap(lambda key: walked(beginning(task, key, steepest=True)))(keys)
+        # A start with a step that does not converge counts 0.
         return ones * jnp.nan_to_num(results).mean(axis=0)
 
-    # Devices of different models may round differently, but must come to the same decisions.
+    # Every device walks, and the first device's result counts: devices of different models may round differently, but
+    # must come to the same decisions.
     evaluate = program(lambda parameters: spread(evaluated, mesh)(parameters, jnp.ones((1, 1)))[0], mesh)
-    return evaluate.lower(parameters).compile(quick_compilation())
+    evaluate = evaluate.lower(state.averaged).compile(quick_compilation())
+    in_one = settings.updates_of(task) * settings.lanes * settings.window
+    return Learner(start, improved, evaluate, in_one, time.perf_counter() - began, mesh)
 
 
 def evaluation_steps(task: LocomotionTask) -> int:
@@ -213,10 +193,11 @@ def evaluation_steps(task: LocomotionTask) -> int:
 
 
 def learn(
-    compiled: CompiledLearner,
+    learner: Learner,
     *,
     seed: int,
-    goal: Goal,
+    steps: int,
+    until: float = math.inf,
     directory: Path | None = None,
     settings: dict[str, Any] | None = None,
     resume: bool = False,
@@ -225,8 +206,8 @@ def learn(
     """Trains until the goal; with a directory, stores the state of every evaluation there and can resume bit for bit.
 
     Args:
-        compiled: result of `compile_learner`; without a directory its state may be any object.
         seed: determines everything random.
+        steps, until: as in `train`.
         directory: an existing folder for checkpoints.
         settings: JSON values that determine the result; a stored run with others is not continued.
         resume: continue the run in the directory, if it has a checkpoint.
@@ -238,36 +219,89 @@ def learn(
     """
     if resume and directory is None:
         raise InputError("resume needs the directory of the run; give it, or start a new run")
-    learner, name = compiled.learner, f"{CHECKPOINT}-{seed}"
-    identity = {"settings": {**(settings or {}), "seed": seed}}
+    name, identity = f"{CHECKPOINT}-{seed}", {"settings": {**(settings or {}), "seed": seed}}
     state = learner.start(seed)
-    best, records = learner.parameters(state), []
+    best, records = state.averaged, []
     if resume and directory is not None and has_checkpoint(directory, name):
-        (state, best), records = _restored(directory, name, identity, (state, best))
+        manifest = checkpoints.load_manifest(directory, name)
+        if manifest.get("settings") != finite_values(identity["settings"]):
+            raise InputError(f"{directory}: the run was started with other settings; give those it was started with")
+        rows = stored_rows(directory / f"{name}.json", manifest, "records", tuple[int, float, float | None, int, float])
+        records = [Record(done, seconds, math.nan if d is None else d, *rest) for done, seconds, d, *rest in rows]
+        state, best = checkpoints.load_tree(directory, name, (state, best))
     highest = max(map(rank, records), default=rank(None))
-    before = records[-1].seconds if records else compiled.seconds
+    before = records[-1].seconds if records else learner.seconds
     began = time.perf_counter()
-    while not (records and (records[-1].steps >= goal.steps or records[-1].distance >= goal.distance)):
+    while not (records and (records[-1].steps >= steps or records[-1].distance >= until)):
         with held_back():
-            state = compiled.improve(state)
-            distance, succeeded = map(float, compiled.evaluate(learner.parameters(state)))
-            steps = (records[-1].steps if records else 0) + learner.steps
+            state = learner.improve(state)
+            distance, succeeded = map(float, learner.evaluate(state.averaged))
+            done = (records[-1].steps if records else 0) + learner.steps
             seconds = before + time.perf_counter() - began
-            records.append(Record(steps, seconds, distance, int(learner.skipped(state)), succeeded))
+            records.append(Record(done, seconds, distance, int(state.skipped), succeeded))
             if rank(records[-1]) > highest:
-                highest, best = rank(records[-1]), learner.parameters(state)
+                highest, best = rank(records[-1]), state.averaged
             if directory is not None:
                 rows = [[value if math.isfinite(value) else None for value in record] for record in records]
                 stored = {**identity, "records": rows}
-                checkpoints.save_tree(directory, name, (state, best), stored, number=steps)
+                checkpoints.save_tree(directory, name, (state, best), stored, number=done)
         report(records[-1])
-    return Learned(local(best, compiled.mesh), records, compiled.seconds)
+    return Learned(local(best, learner.mesh), records, learner.seconds)
 
 
-def _restored(directory: Path, name: str, identity: dict[str, Any], like: Any) -> tuple[Any, list[Record]]:
-    manifest = checkpoints.load_manifest(directory, name)
-    if manifest.get("settings") != finite_values(identity["settings"]):
-        raise InputError(f"{directory}: the run was started with other settings; give those it was started with")
-    rows = stored_rows(directory / f"{name}.json", manifest, "records", tuple[int, float, float | None, int, float])
-    records = [Record(steps, seconds, math.nan if d is None else d, *rest) for steps, seconds, d, *rest in rows]
-    return checkpoints.load_tree(directory, name, like), records
+class Trials(NamedTuple):
+    """Results of n episodes from perturbed starts."""
+
+    distance: Float[np.ndarray, " n"]
+    """Body lengths before a fall; NaN if a step did not converge."""
+    steps: Int[np.ndarray, " n"]
+    """Steps before a fall, or all."""
+    ahead: Float[np.ndarray, " n"]
+    """Gravity along x, in m/s²: positive downhill, negative uphill, 0 on level ground."""
+
+    def standing(self, steps: int) -> Bool[np.ndarray, " n"]:
+        """Returns which episodes of this many steps end without a fall."""
+        return np.isfinite(self.distance) & (self.steps >= steps)
+
+
+def perturbed_trials(
+    task: LocomotionTask,
+    policy: Policy,
+    parameters: Parameters,
+    *,
+    starts: int = STARTS,
+    steps: int = STEPS,
+    seed: int = SEED,
+) -> Trials:
+    """Runs episodes from starts drawn by the task's variation, on its steepest slopes."""
+    task = task._replace(episode=steps)
+
+    def trial(parameters: Parameters, key: Array):
+        start = beginning(task, key, steepest=True)
+        episode = run_episode(task, partial(policy.apply, parameters), start)
+        return *episode, jnp.asarray(0.0) if start.world.gravity is None else start.world.gravity[0]
+
+    keys = jax.random.split(jax.random.key(seed), starts)
+    trials = jax.jit(lambda parameters: jax.lax.map(partial(trial, parameters), keys, batch_size=AT_ONCE))
+    return Trials(*map(np.asarray, trials(parameters)))
+
+
+def numbers_of(trials: Trials, steps: int = STEPS) -> dict[str, float]:
+    """Returns metrics: episodes, those without a fall, and the distance of the median and of the worst episode.
+
+    On slopes also the episodes without a fall, and distances, downhill and uphill.
+    """
+    standing = trials.standing(steps)
+    numbers = {"perturbed_starts": float(len(standing)), "perturbed_steps": float(steps)}
+    groups = {"": np.ones_like(standing), "_downhill": trials.ahead > 0, "_uphill": trials.ahead < 0}
+    for name, group in groups.items():
+        if not group.any():
+            continue
+        finite = trials.distance[group & np.isfinite(trials.distance)]
+        if name:
+            numbers[f"perturbed_starts{name}"] = float(group.sum())
+        numbers[f"perturbed_without_fall{name}"] = float(standing[group].sum())
+        if len(finite):
+            numbers[f"perturbed_distance_body_lengths_median{name}"] = float(np.median(finite))
+            numbers[f"perturbed_distance_body_lengths_least{name}"] = float(finite.min())
+    return numbers

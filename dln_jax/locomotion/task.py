@@ -6,12 +6,16 @@
     posture = 1 - cos tilt + (max(0, 0.8 - y / y_rest) / 0.2)²
 
 A policy maps the observation to the change of the muscles' actuation, which starts at 1. It sees the body in its own
-frame, with origin o and axes R (`frames`), so all places along the ground are equivalent. L is the body length, u
-points against gravity, and h is the horizontal direction nearest to x. c is a clock, sin and cos of 2 pi t / P at step
-t; a period P of 0 leaves it out. Speeds far above s are hardly rewarded, because a creature that runs as fast as it can
-falls on downhill slopes; s = 0 rewards all speeds alike. The tilt is the angle between the body's up and the ground's
-normal, and y is the mean height. A body that has tilted by more than 1 rad has fallen, which ends the episode; distance
-after it does not count, since tall bodies would go far by rolling.
+frame, so all places along the ground are equivalent. Its origin o and axes R are weighted sums of the vertices:
+
+    o = w x,    a = axes x / |axes x|,    R = rows (a, b),    b = a turned by 90 degrees          in the plane
+    R = rows (a, c x a, c),    c = a x (second axis) normalised                                    in space
+
+L is the body length, u points against gravity, and h is the horizontal direction nearest to x. c is a clock, sin and
+cos of 2 pi t / P at step t; a period P of 0 leaves it out. Speeds far above s are hardly rewarded, because a creature
+that runs as fast as it can falls on downhill slopes; s = 0 rewards all speeds alike. The tilt is the angle between the
+body's up and the ground's normal, and y is the mean height. A body that has tilted by more than 1 rad has fallen, which
+ends the episode; distance after it does not count, since tall bodies would go far by rolling.
 """
 
 from collections.abc import Callable
@@ -19,9 +23,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dln_jax.locomotion.frames import Frame, axes_of, fitted_frame
 from dln_jax.locomotion.worlds import (
     FLAT,
     Variation,
@@ -33,30 +37,18 @@ from dln_jax.locomotion.worlds import (
     require_variation,
 )
 from dln_jax.softbody.examples import creature_scene
-from dln_jax.softbody.mesh.shapes import Creature, biped, body_length, box_quadruped, crawler, quadruped
+from dln_jax.softbody.mesh.shapes import Creature, body_length
 from dln_jax.softbody.scene import Params, SoftScene, State
 from dln_jax.softbody.step import Stepper, make_step
 from dln_jax.softbody.terms.creature import TIME_STEP
 from dln_jax.types import InputError, require_positive
 
-CREATURES: dict[str, Callable[[], Creature]] = {
-    "crawler": crawler,
-    "biped": biped,
-    "quadruped": quadruped,
-    "box-quadruped": box_quadruped,
-}
-EPISODE = 400
-"""Steps of an episode."""
 SHORTEST = 0.25
 """Smallest actuation: length of a muscle relative to its rest length; the largest is 1."""
 LARGEST_CHANGE = 0.3
 """Largest change of an actuation in one step, as published."""
 POSITION_UNIT = 0.1
 """Unit of observed positions, in body lengths."""
-UPRIGHT = 0.05
-"""w, in body lengths per step."""
-SPEED = 0.04
-"""s, in body lengths per step; 0 for no limit."""
 CROUCHED = 0.8
 """Crouching is penalised below this mean height, relative to that at rest."""
 FALLEN = 1.0
@@ -68,6 +60,15 @@ FALL = 1.0
 
 Act = Callable[[Float[Array, " o"]], Float[Array, " k"]]
 """Observation -> change of the actuation."""
+
+
+class Frame(NamedTuple):
+    """Weights of the vertices in the origin and the axes of a body's frame."""
+
+    origin: Float[np.ndarray, " n"]
+    """They sum to 1."""
+    axes: Float[np.ndarray, "axes n"]
+    """One axis in the plane, two in space; their weights sum to 0."""
 
 
 class LocomotionTask(NamedTuple):
@@ -143,9 +144,9 @@ def make_task(
     *,
     scene: SoftScene | None = None,
     dt: float = TIME_STEP,
-    episode: int = EPISODE,
-    upright: float = UPRIGHT,
-    speed: float = SPEED,
+    episode: int = 400,
+    upright: float = 0.05,
+    speed: float = 0.04,
     variation: Variation = FLAT,
     frame: Frame | None = None,
     clock_period: float = CLOCK_PERIOD,
@@ -179,13 +180,6 @@ def make_task(
     return LocomotionTask(creature, scene, stepper, frame, length, episode, upright, speed, variation, clock_period, dt)
 
 
-def creature_named(name: str) -> Creature:
-    """Returns the creature of this name; `InputError` lists the names if it is unknown."""
-    if name not in CREATURES:
-        raise InputError(f"creature '{name}' is unknown; choose from {', '.join(CREATURES)}")
-    return CREATURES[name]()
-
-
 def beginning(task: LocomotionTask, key: Array | None = None, *, steepest: bool = False) -> EpisodeState:
     """Returns the rest shape at rest on level ground or, given a key, a start perturbed by the task's variation.
 
@@ -212,11 +206,10 @@ def observe(task: LocomotionTask, place: EpisodeState) -> Float[Array, " o"]:
         ahead = jnp.eye(3, dtype=x.dtype)[0] - up[0] * up
         directions.append(R @ (ahead / jnp.linalg.norm(ahead)))
     parts = [moved.ravel() / (POSITION_UNIT * task.length), (place.state.v @ R.T).ravel() / task.length]
+    directions.append(place.actuation)
     if task.clock_period:
         angle = 2.0 * jnp.pi / task.clock_period * place.steps.astype(x.dtype)
-        directions += [place.actuation, jnp.stack([jnp.sin(angle), jnp.cos(angle)])]
-    else:
-        directions.append(place.actuation)
+        directions.append(jnp.stack([jnp.sin(angle), jnp.cos(angle)]))
     return jnp.concatenate([*parts, *directions])
 
 
@@ -269,25 +262,21 @@ def walk(task: LocomotionTask, act: Act, start: EpisodeState, steps: int) -> tup
     return jax.lax.scan(one, start, length=steps)
 
 
-class Episode(NamedTuple):
-    """Results of an episode; NaN if a step before a fall did not converge."""
-
-    distance: Float[Array, ""]
-    """Body lengths before a fall, if any; the criterion for policies."""
-    steps: Int[Array, ""]
-    """Steps before a fall."""
-
-
-def run_episode(task: LocomotionTask, act: Act, start: EpisodeState | None = None) -> Episode:
-    """Runs one episode, from rest unless a start is given."""
+def run_episode(
+    task: LocomotionTask, act: Act, start: EpisodeState | None = None
+) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """Runs one episode, from rest unless a start is given, and returns what `judged` says of it."""
     return judged(walk(task, act, beginning(task) if start is None else start, task.episode)[1])
 
 
-def judged(seen: Walk) -> Episode:
-    """Evaluates the steps of an episode."""
+def judged(seen: Walk) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """Returns the distance of an episode in body lengths and its steps, both before a fall, if any.
+
+    The distance is the criterion for policies. It is NaN if a step before a fall did not converge.
+    """
     standing = jnp.cumsum(seen.tilt > FALLEN) == 0
     usable = jnp.where((seen.converged | ~standing).all(), 1.0, jnp.nan)
-    return Episode(usable * jnp.sum(jnp.where(standing, seen.travelled, 0.0)), standing.sum())
+    return usable * jnp.sum(jnp.where(standing, seen.travelled, 0.0)), standing.sum()
 
 
 def chosen(condition: Any, new: Any, old: Any) -> Any:
@@ -309,3 +298,21 @@ def _posture(task: LocomotionTask, x: Float[Array, "n dim"]) -> tuple[Float[Arra
     # The axis of the body's frame that points up at rest.
     cosine = axes_of(task.frame, rest)[:, -1] @ axes_of(task.frame, x)[:, -1]
     return cosine, lowered
+
+
+def fitted_frame(vertices: Float[np.ndarray, "n dim"]) -> Frame:
+    """Frame that follows all vertices: their mean, and the images of x (and y) under the least-squares affine map."""
+    count, dimension = vertices.shape
+    offsets = vertices - vertices.mean(axis=0)
+    return Frame(np.full(count, 1 / count), np.linalg.pinv(offsets)[: dimension - 1])
+
+
+def axes_of(frame: Frame, x: Float[Array, "n dim"]) -> Float[Array, "dim dim"]:
+    """Returns the rotation R into the frame, whose rows are the axes."""
+    a, *others = jnp.asarray(frame.axes, x.dtype) @ x
+    a = a / jnp.linalg.norm(a)
+    if not others:
+        return jnp.stack([a, jnp.stack([-a[1], a[0]])])
+    c = jnp.cross(a, others[0])
+    c = c / jnp.linalg.norm(c)
+    return jnp.stack([a, jnp.cross(c, a), c])

@@ -21,18 +21,17 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from dln_jax.softbody.contact.barrier import Contact
 from dln_jax.softbody.contact.bodies import body_contact
-from dln_jax.softbody.contact.contact import Contact
 from dln_jax.softbody.driven import Example
 from dln_jax.softbody.mesh.mesh import Mesh, boundary, lumped_masses, vertices_where
-from dln_jax.softbody.mesh.quadratic import quadratic, with_midsides
-from dln_jax.softbody.mesh.shapes import Creature, body_length, box, crawler, disc
+from dln_jax.softbody.mesh.shapes import Creature, body_length, box, crawler, disc, quadratic, with_midsides
 from dln_jax.softbody.mesh.shapes import beam as beam_mesh
 from dln_jax.softbody.scene import SoftScene, make_scene
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.creature import MASS, TIME_STEP, Bumps, creature_terms
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.strain_energies import StrainEnergy, stable_neo_hookean
 from dln_jax.softbody.terms.term import Numbers, Term
 from dln_jax.types import InputError

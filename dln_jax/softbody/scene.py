@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dln_jax.softbody.contact.contact import Contact
+from dln_jax.softbody.contact.barrier import Contact
 from dln_jax.softbody.contact.crossings import crossings
 from dln_jax.softbody.mesh.mesh import Mesh, indices_of, lumped_masses
 from dln_jax.softbody.terms.term import Context, Pose, Term

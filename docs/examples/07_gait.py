@@ -12,9 +12,10 @@ import numpy as np
 
 from dln_jax.figures import style
 from dln_jax.figures.soft_bodies import soft_body_drawing
-from dln_jax.locomotion.gradient import shown_walk, train
-from dln_jax.locomotion.learning import Goal
-from dln_jax.locomotion.task import creature_named, make_task
+from dln_jax.locomotion.gradient import make_policy, shown_walk
+from dln_jax.locomotion.learning import train
+from dln_jax.locomotion.task import make_task
+from dln_jax.softbody.mesh.shapes import creature_named
 
 jax.config.update("jax_enable_x64", True)
 
@@ -37,22 +38,23 @@ print(f"{len(task.creature.mesh.vertices)} vertices, {task.muscle_count} muscles
 # muscles, which changes by at most 0.3 per step.
 
 records = []
-trained = train(
+(trained,) = train(
     task,
     seeds=[0],
-    goal=Goal(steps=STEPS, distance=GOAL),
+    steps=STEPS,
+    until=GOAL,
     report=lambda seed, record: records.append(record),
 )
 for record in records[:: max(1, len(records) // 5)]:
     print(f"{record.steps:6d} environment steps, {record.seconds:4.0f} s: {record.distance:5.2f} body lengths")
-assert trained.best.distance > 1.0
+assert trained.distance > 1.0
 
 # %%
 # The gait
 # --------
 # The first figure shows the creature in the middle of its walk; contracted muscles are red.
 
-seen = shown_walk(task, trained.policy, trained.best.parameters, task.episode)
+seen = shown_walk(task, make_policy(task), trained.parameters, task.episode)
 assert seen.converged.all()
 moment = int(np.asarray(seen.actuation).std(axis=1).argmax())
 muscles, lengths = task.creature.muscles, seen.actuation[moment : moment + 1]

@@ -19,13 +19,12 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from dln_jax.figures import style
 from dln_jax.rollout import rollout
 from dln_jax.softbody.mesh.files import read_mesh, write_motion
-from dln_jax.softbody.mesh.mesh import boundary
-from dln_jax.softbody.mesh.sets import values_by_set, vertices_in
+from dln_jax.softbody.mesh.mesh import boundary, values_by_set, vertices_in
 from dln_jax.softbody.mesh.shapes import lattice
 from dln_jax.softbody.scene import make_scene
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 
 jax.config.update("jax_enable_x64", True)

@@ -29,15 +29,12 @@ from dln_jax.softbody.contact.bodies import body_contact
 from dln_jax.softbody.contact.crossings import crossings
 from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
 from dln_jax.softbody.driven import Example, drive, driven_step
-from dln_jax.softbody.mesh.mesh import lumped_masses, make_mesh, vertices_where
-from dln_jax.softbody.mesh.placement import join, translate
-from dln_jax.softbody.mesh.sets import values_by_set
-from dln_jax.softbody.mesh.shapes import disc, lattice
+from dln_jax.softbody.mesh.mesh import lumped_masses, make_mesh, values_by_set, vertices_where
+from dln_jax.softbody.mesh.shapes import disc, join, lattice, translate
 from dln_jax.softbody.mesh.surfaces import enclosed_volume, inner_surface, surface_parts
 from dln_jax.softbody.scene import make_scene, potential
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
-from dln_jax.softbody.terms.pressure import pressure
+from dln_jax.softbody.terms.loads import gravity, pressure
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 
 jax.config.update("jax_enable_x64", True)

@@ -22,7 +22,7 @@ from dln_jax.softbody.mesh.shapes import beam
 from dln_jax.softbody.scene import make_scene, with_parameters
 from dln_jax.softbody.step import make_step, positions_and_convergence
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 
 jax.config.update("jax_enable_x64", True)

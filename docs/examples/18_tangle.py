@@ -26,13 +26,11 @@ from dln_jax.rollout import rollout
 from dln_jax.softbody.contact.bodies import body_contact
 from dln_jax.softbody.contact.crossings import crossings
 from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
-from dln_jax.softbody.mesh.placement import join, rotate, translate
-from dln_jax.softbody.mesh.shapes import beam
+from dln_jax.softbody.mesh.shapes import beam, join, rotate, translate
 from dln_jax.softbody.scene import make_scene
 from dln_jax.softbody.step import make_step
-from dln_jax.softbody.terms.damping import mass_damping
-from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.elasticity import elastic, mass_damping
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 
 jax.config.update("jax_enable_x64", True)

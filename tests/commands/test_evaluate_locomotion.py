@@ -10,9 +10,10 @@ from calls import assert_refused, command, json_of, one_line
 
 from dln_jax.commands import evaluate_locomotion, train_locomotion
 from dln_jax.commands.locomotion import judge, load_policy
-from dln_jax.locomotion.learning import make_policy
-from dln_jax.locomotion.perturbed import Trials, numbers_of
-from dln_jax.locomotion.task import creature_named, make_task
+from dln_jax.locomotion.gradient import make_policy
+from dln_jax.locomotion.learning import Trials, numbers_of
+from dln_jax.locomotion.task import make_task
+from dln_jax.softbody.mesh.shapes import creature_named
 from dln_jax.zoo.parameter_files import save_tree
 
 STEPS = 10

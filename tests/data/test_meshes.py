@@ -1,5 +1,7 @@
 """Meshes against geometry and topology, nonsense against its messages, and creatures against their drawings."""
 
+import itertools
+
 import numpy as np
 import pytest
 from calls import one_line
@@ -9,7 +11,6 @@ from scipy.spatial import ConvexHull, Delaunay
 from dln_jax.softbody.mesh.mesh import (
     boundary,
     components,
-    edges,
     lumped_masses,
     make_mesh,
     overlaps,
@@ -41,6 +42,11 @@ def outward_normals(vertices, facet):
 def flux(vertices, facet):
     """Of the field x through facets, which is dim times the volume inside if all point outwards."""
     return np.sum(outward_normals(vertices, facet) * vertices[facet].mean(axis=1))
+
+
+def edges(mesh):
+    pairs = list(itertools.combinations(range(mesh.dimension + 1), 2))
+    return np.unique(np.sort(mesh.elements[:, pairs].reshape(-1, 2), axis=1), axis=0)
 
 
 def euler_characteristic(mesh):

@@ -16,29 +16,36 @@ from PIL import Image
 from dln_jax.commands import train_locomotion
 from dln_jax.figures.animations import write_gif
 from dln_jax.figures.soft_bodies import soft_body_drawing
-from dln_jax.locomotion import gradient
-from dln_jax.locomotion.environment import CreatureEnvironment
-from dln_jax.locomotion.frames import Frame, axes_of, fitted_frame
-from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
-from dln_jax.locomotion.learning import Goal, Learned, Record, compile_learner, learn, make_policy
-from dln_jax.locomotion.task import FALLEN, Walk, advance, beginning, judged, make_task
-from dln_jax.locomotion.value import Window, targets
+from dln_jax.locomotion import learning
+from dln_jax.locomotion.gradient import GradientSettings, make_policy, make_updates, targets
+from dln_jax.locomotion.learning import Learned, Record, learn, make_learner, train
+from dln_jax.locomotion.task import (
+    FALLEN,
+    Frame,
+    Walk,
+    advance,
+    axes_of,
+    beginning,
+    fitted_frame,
+    judged,
+    make_task,
+)
 from dln_jax.locomotion.worlds import Variation
 from dln_jax.scale import AXIS
 from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
 from dln_jax.softbody.mesh.mesh import make_mesh
-from dln_jax.softbody.mesh.placement import translate
-from dln_jax.softbody.mesh.shapes import Creature, lattice
+from dln_jax.softbody.mesh.shapes import Creature, lattice, translate
 from dln_jax.softbody.scene import make_scene
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.springs import muscles
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
+from scripts.reports.cases.locomotion import CreatureEnvironment
 
 EPISODE = 12
 WINDOW = 6
 STEPS = 10_000
-QUICK = GradientSettings(window=WINDOW, lanes=2, learning_rate=0.05, updates=4, value_fits=4)
+QUICK = GradientSettings(width=3, window=WINDOW, lanes=2, learning_rate=0.05, updates=4, value_fits=4)
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +64,8 @@ def policy(task):
 
 
 @pytest.fixture(scope="module")
-def compiled(task, policy):
-    return compile_learner(task, make_gradient_learner(task, policy, QUICK, steps=STEPS))
+def learner(task, policy):
+    return make_learner(task, policy, QUICK, steps=STEPS)
 
 
 @pytest.fixture(scope="module")
@@ -141,23 +148,24 @@ def test_actuation_changes_by_at_most_0_3_and_stays_in_range(task):
 def test_what_a_fallen_body_travels_does_not_count():
     tilt = jnp.asarray([0.0, 0.9 * FALLEN, 1.1 * FALLEN, 0.0])
     seen = Walk(jnp.zeros((4, 6, 2)), jnp.ones((4, 2)), jnp.ones(4, bool), jnp.full(4, 0.1), jnp.zeros(4), tilt)
-    episode = judged(seen)
-    np.testing.assert_allclose(episode.distance, 0.2, rtol=1e-12)
-    assert episode.steps == 2
-    before, later = (judged(seen._replace(converged=jnp.arange(4) != step)).distance for step in (1, 3))
+    distance, steps = judged(seen)
+    np.testing.assert_allclose(distance, 0.2, rtol=1e-12)
+    assert steps == 2
+    before, later = (judged(seen._replace(converged=jnp.arange(4) != step))[0] for step in (1, 3))
     assert np.isnan(before) and not np.isnan(later)
 
 
 def test_targets_are_the_sum_over_n_step_returns():
     random = np.random.default_rng(0)
     rewards, values, g, k = random.normal(size=5), random.normal(size=6), 0.9, 0.7
-    window = Window(jnp.zeros((6, 1)), jnp.asarray(rewards), jnp.ones(6))
     n_step = [sum(g**t * rewards[t] for t in range(n)) + g**n * values[n] for n in range(1, 6)]
     expected = sum((1 - k) * k**n * n_step[n] for n in range(4)) + k**4 * n_step[4]
-    np.testing.assert_allclose(targets(window, jnp.asarray(values), g, k)[0], expected, rtol=1e-12)
-    fallen = window._replace(alive=jnp.asarray([1.0, 1.0, 0.0, 0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(
+        targets(jnp.asarray(rewards), jnp.ones(6), jnp.asarray(values), g, k)[0], expected, rtol=1e-12
+    )
+    alive = jnp.asarray([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
     first = rewards[0] + g * ((1 - k) * values[1] + k * rewards[1])
-    np.testing.assert_allclose(targets(fallen, jnp.asarray(values), g, k)[0], first, rtol=1e-12)
+    np.testing.assert_allclose(targets(jnp.asarray(rewards), alive, jnp.asarray(values), g, k)[0], first, rtol=1e-12)
 
 
 def test_a_slope_is_a_direction_of_gravity_and_flat_worlds_hold_nothing(task):
@@ -168,59 +176,58 @@ def test_a_slope_is_a_direction_of_gravity_and_flat_worlds_hold_nothing(task):
     assert beginning(task).world == (None, None, None, None)
 
 
-def test_gradients_increase_the_distance_and_the_same_seed_gives_the_same(compiled):
-    first = learn(compiled, seed=0, goal=Goal(20 * compiled.learner.steps))
+def test_gradients_increase_the_distance_and_the_same_seed_gives_the_same(learner):
+    first = learn(learner, seed=0, steps=20 * learner.steps)
     assert first.distance > max(0.005, 2 * first.records[0].distance)
     assert [record.steps for record in first.records] == [48 * (n + 1) for n in range(20)]
     assert first.records[-1].skipped == 0
-    again, other = (learn(compiled, seed=seed, goal=Goal(2 * compiled.learner.steps)) for seed in (0, 1))
+    again, other = (learn(learner, seed=seed, steps=2 * learner.steps) for seed in (0, 1))
     assert [r.distance for r in again.records] == [r.distance for r in first.records[:2]]
     assert [r.distance for r in other.records] != [r.distance for r in first.records[:2]]
 
 
-def test_an_interrupt_waits_for_the_checkpoint_and_a_resumed_run_continues_bit_for_bit(compiled, tmp_path):
+def test_an_interrupt_waits_for_the_checkpoint_and_a_resumed_run_continues_bit_for_bit(learner, tmp_path):
     # A shell that starts the tests in the background has them ignore interrupts.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    def learned(compiled, folder, width=3, **keywords):
+    def learned(learner, folder, width=3, **keywords):
         folder.mkdir(exist_ok=True)
-        goal, settings = Goal(3 * compiled.learner.steps), {"width": width}
-        return learn(compiled, seed=3, goal=goal, directory=folder, settings=settings, **keywords)
+        steps, settings = 3 * learner.steps, {"width": width}
+        return learn(learner, seed=3, steps=steps, directory=folder, settings=settings, **keywords)
 
     def interrupted(state):
         os.kill(os.getpid(), signal.SIGINT)
-        return compiled.improve(state)
+        return learner.improve(state)
 
     with pytest.raises(KeyboardInterrupt):
-        learned(compiled._replace(improve=interrupted), tmp_path / "parts")
+        learned(learner._replace(improve=interrupted), tmp_path / "parts")
     signal.signal(signal.SIGINT, before)
     assert len(json_of(tmp_path / "parts" / "checkpoint-3.json")["records"]) == 1
-    continued, whole = learned(compiled, tmp_path / "parts", resume=True), learned(compiled, tmp_path / "whole")
+    continued, whole = learned(learner, tmp_path / "parts", resume=True), learned(learner, tmp_path / "whole")
     assert [r.distance for r in continued.records] == [r.distance for r in whole.records]
     assert same(continued.parameters, whole.parameters)
     with one_line("other settings"):
-        learned(compiled, tmp_path / "parts", width=4, resume=True)
+        learned(learner, tmp_path / "parts", width=4, resume=True)
     with one_line("resume needs the directory"):
-        learn(compiled, seed=3, goal=Goal(999), resume=True)
+        learn(learner, seed=3, steps=999, resume=True)
 
 
 def test_training_further_begins_at_the_stored_policy(task, policy, monkeypatch):
-    compiled, initial = [], policy.init(jax.random.key(9))
-    monkeypatch.setattr(gradient, "compile_learner", lambda task, learner, mesh: compiled.append(learner))
-    monkeypatch.setattr(gradient, "learn_seeds", lambda *_, **__: gradient.TrainedPolicies(policy, []))
-    gradient.train(task, seeds=[0], goal=Goal(1), width=3, initial=initial)
-    gradient.train(task, seeds=[0], goal=Goal(1), width=3)
-    further, new = (learner.parameters(learner.start(0)) for learner in compiled)
+    policies, initial = [], policy.init(jax.random.key(9))
+    monkeypatch.setattr(learning, "make_learner", lambda task, policy, *_, **__: policies.append(policy))
+    train(task, seeds=[], steps=1, settings=QUICK, initial=initial)
+    train(task, seeds=[], steps=1, settings=QUICK)
+    further, new = (make_updates(task, policy, QUICK, steps=1)[0](0).averaged for policy in policies)
     assert same(further, initial) and not same(new, initial)
 
 
-def test_the_rate_falls_and_averages_follow_the_parameters(compiled):
+def test_the_rate_falls_and_averages_follow_the_parameters(learner):
     def away(one, other):
         return max(np.abs(a - b).max() for a, b in zip(*map(jax.tree.leaves, (one, other)), strict=True))
 
-    state = compiled.learner.start(0)
+    state = learner.start(0)
     late = state._replace(optimiser=jax.tree.map(lambda a: a + 10**6 * (a.dtype.kind == "i"), state.optimiser))
-    after, after_late = map(compiled.improve, (state, late))
+    after, after_late = map(learner.improve, (state, late))
     moved = away(state.parameters, after.parameters)
     assert 0 < away(after.averaged, after.parameters) < moved
     assert 0 < away(state.parameters, after_late.parameters) < 0.1 * moved
@@ -233,11 +240,11 @@ def test_selection_prefers_starts_that_succeed_and_then_distance():
     assert Learned({}, records[2:], 0.0).selected is None
 
 
-def test_updates_without_a_gradient_are_skipped_and_counted(compiled):
-    state = compiled.learner.start(0)
+def test_updates_without_a_gradient_are_skipped_and_counted(learner):
+    state = learner.start(0)
     x = state.lanes.state.x
     lost = state._replace(lanes=state.lanes._replace(state=state.lanes.state._replace(x=x.at[0, 0, 0].set(jnp.nan))))
-    after = compiled.improve(lost)
+    after = learner.improve(lost)
     # The lane is restarted, so that the next updates are usable.
     assert after.skipped == 1 and after.updates == QUICK.updates
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
@@ -261,7 +268,7 @@ def test_mistakes_are_one_line(capsys, tmp_path):
 def test_devices_that_do_not_divide_the_creatures_are_refused(task, policy):
     mesh = Mesh(np.array(7 * jax.devices()[:1]), (AXIS,))
     with one_line("creatures side by side cannot be split over 7 devices"):
-        make_gradient_learner(task, policy, QUICK, steps=STEPS, mesh=mesh)
+        make_updates(task, policy, QUICK, steps=STEPS, mesh=mesh)
 
 
 def test_animations_hold_their_frames_and_refuse_what_does_not_fit(task, tmp_path):

@@ -16,8 +16,8 @@ from dln_jax.control.optimal.fitted import Iteration, fit_value
 from dln_jax.control.optimal.problem import ControlProblem
 from dln_jax.control.optimal.residual import fit_hjb
 from dln_jax.control.optimal.value_networks import value_network
-from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
-from dln_jax.locomotion.learning import Goal, compile_learner, learn, make_policy
+from dln_jax.locomotion.gradient import GradientSettings, make_policy
+from dln_jax.locomotion.learning import learn, make_learner
 from dln_jax.locomotion.task import make_task
 from dln_jax.scale import batch_mesh
 from dln_jax.softbody.identification import ObservedMotions, identify
@@ -38,17 +38,17 @@ def block():
     return make_task(Creature("block", mesh, np.array([[0, 2]])), episode=3, clock_period=4.0, upright=0.1)
 
 
-def walked(folder, name, compiled):
+def walked(folder, name, learner):
     """Parameters and distances of a run of two updates, and of one that is continued after the first."""
-    given, steps = {"seed": 1, "settings": {"learner": name}}, compiled.learner.steps
-    half, whole = folder / "half" / name, Goal(2 * steps)
+    given, steps = {"seed": 1, "settings": {"learner": name}}, learner.steps
+    half, whole = folder / "half" / name, 2 * steps
     if not half.exists():
         half.mkdir(parents=True)
-        learn(compiled, goal=Goal(steps), directory=half, **given)
+        learn(learner, steps=steps, directory=half, **given)
     copy = shutil.copytree(half, folder / f"{name}-{sys.argv[2]}")
     runs = [
-        learn(compiled, goal=whole, **given),
-        learn(compiled, goal=whole, directory=copy, resume=True, **given),
+        learn(learner, steps=whole, **given),
+        learn(learner, steps=whole, directory=copy, resume=True, **given),
     ]
     return [(run.parameters, [record.distance for record in run.records]) for run in runs]
 
@@ -86,8 +86,8 @@ def main(folder, name, *, whole):
     found = {"stiffness": stiffness(mesh), "value": value(mesh)}
     if whole:
         task, settings = block(), GradientSettings(window=3, lanes=4, updates=1)
-        gradient = make_gradient_learner(task, make_policy(task, width=2), settings, steps=1000, mesh=mesh)
-        found |= {"gradient": walked(folder, "gradient", compile_learner(task, gradient, mesh))}
+        gradient = make_learner(task, make_policy(task, width=2), settings, steps=1000, mesh=mesh)
+        found |= {"gradient": walked(folder, "gradient", gradient)}
         found |= {"equation": equation(mesh)}
     arrays = {
         f"{subject} {number}": np.asarray(leaf)

@@ -11,26 +11,21 @@ from scipy.optimize import fsolve
 
 from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.mesh.mesh import NamedSet, boundary, make_mesh, volumes
-from dln_jax.softbody.mesh.quadratic import quadratic
-from dln_jax.softbody.mesh.shapes import beam, box, lattice
+from dln_jax.softbody.mesh.shapes import beam, box, lattice, quadratic
 from dln_jax.softbody.mesh.surfaces import (
     closed_surface,
     enclosed_volume,
     facets_in,
     inner_surface,
-    outer_surface,
     surface_parts,
 )
 from dln_jax.softbody.scene import make_scene, potential, with_parameters
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.fibres import fibres
-from dln_jax.softbody.terms.gravity import gravity
-from dln_jax.softbody.terms.loads import body_force, point_force, traction
-from dln_jax.softbody.terms.pressure import gas, pressure
-from dln_jax.softbody.terms.springs import muscles
+from dln_jax.softbody.terms.loads import body_force, gas, gravity, point_force, pressure, traction
+from dln_jax.softbody.terms.springs import muscles, path_length, tendon_of_length, tendon_of_tension
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
-from dln_jax.softbody.terms.tendons import path_length, tendon_of_length, tendon_of_tension
 
 E, NU = 1e5, 0.3
 
@@ -68,7 +63,7 @@ def test_surfaces_enclose_the_volume_of_the_body_and_of_its_cavity():
         outer, wall = surface_parts(mesh)
         cavity = enclosed_volume(mesh.vertices, closed_surface(mesh, inner_surface(mesh)))
         assert cavity == pytest.approx(expected, rel=1e-12)
-        whole = enclosed_volume(mesh.vertices, outer_surface(mesh))
+        whole = enclosed_volume(mesh.vertices, surface_parts(mesh)[0])
         assert whole - cavity == pytest.approx(volumes(mesh).sum(), rel=1e-12)
         assert enclosed_volume(mesh.vertices, wall) == pytest.approx(-cavity)
         assert len(outer) + len(wall) == len(boundary(mesh))
@@ -197,7 +192,7 @@ def actuated():
         tendon_of_length(mesh, [8, 10, 12], stiffness=3e4),
         fibres(mesh, (1.0, 0.5), strength=2e4, groups=np.arange(16) % 2),
         muscles([[8, 12], [9, 13]], stiffness=900.0),
-        traction(mesh, outer_surface(mesh), name="wind"),
+        traction(mesh, surface_parts(mesh)[0], name="wind"),
         gravity(mesh),
     ]
     return mesh, make_scene(mesh, terms, held=[8, 9])
@@ -259,7 +254,7 @@ def test_mistakes_of_actuators_say_what_is_wrong():
         (lambda: tendon_of_tension(mesh, [[0.7, 0.0], [3.0, 0.0]], tension=1.0), "point 1 at .3.0, 0.0. m is outside"),
         (lambda: tendon_of_tension(mesh, [0, 0], tension=1.0), "points 0 and 1 of the path coincide"),
         (lambda: fibres(mesh, (0.0, 0.0), strength=1.0), "direction of fibres 0 has no length"),
-        (lambda: traction(mesh, outer_surface(mesh), [1.0, 2.0, 3.0]), "has shape .3.; expected .2."),
+        (lambda: traction(mesh, surface_parts(mesh)[0], [1.0, 2.0, 3.0]), "has shape .3.; expected .2."),
         (lambda: gas(mesh, wall, pressure=-2e5), "absolute pressure"),
     ):
         with one_line(words):

@@ -14,10 +14,18 @@ from hypothesis import strategies as st
 
 from dln_jax.commands import simulate
 from dln_jax.softbody.mesh.files import read_mesh, write_mesh, write_motion
-from dln_jax.softbody.mesh.mesh import Mesh, NamedSet, boundary, components, make_mesh, volumes
-from dln_jax.softbody.mesh.sets import values_by_set, vertices_in
+from dln_jax.softbody.mesh.mesh import (
+    Mesh,
+    NamedSet,
+    boundary,
+    components,
+    make_mesh,
+    values_by_set,
+    vertices_in,
+    volumes,
+)
 from dln_jax.softbody.mesh.shapes import beam, box
-from dln_jax.softbody.mesh.solids import FileMesh, solid_mesh
+from dln_jax.softbody.mesh.solids import FileMesh, corners_by_kind, solid_mesh
 from dln_jax.types import InputError
 
 BODIES = {2: beam(2.0, 1.0, 4, 2), 3: box((2.0, 1.0, 1.0), (4, 2, 2))}
@@ -163,7 +171,8 @@ def test_elements_of_higher_order_are_reduced_to_their_corners():
     n, m = len(mesh.vertices), len(mesh.elements)
     points = np.pad(mesh.vertices, ((0, 1), (0, 1)), constant_values=0.2)
     curved = np.pad(mesh.elements, ((0, 0), (0, 3)), constant_values=n)
-    read = solid_mesh(FileMesh(points, {"triangle6": curved}, {}, {"all": {"triangle6": np.arange(m)}}))
+    cells, count = corners_by_kind([("triangle", curved)])
+    read = solid_mesh(FileMesh(points, cells, {}, {"all": {"triangle": np.arange(m)}}, count))
     np.testing.assert_array_equal(read.mesh.vertices, mesh.vertices)
     np.testing.assert_array_equal(read.mesh.elements, mesh.elements)
     assert f"{m} elements of higher order" in read.statements[0] and len(read.mesh.sets["all"].vertices) == n

@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 from calls import one_line
 
-from dln_jax.softbody.mesh.mesh import NamedSet, components, volumes
-from dln_jax.softbody.mesh.placement import join, rotate, translate
-from dln_jax.softbody.mesh.quadratic import quadratic
-from dln_jax.softbody.mesh.sets import values_by_set, vertices_in
-from dln_jax.softbody.mesh.shapes import beam, box
+from dln_jax.softbody.mesh.mesh import NamedSet, components, values_by_set, vertices_in, volumes
+from dln_jax.softbody.mesh.shapes import beam, box, join, quadratic, rotate, translate
 
 BODIES = beam(0.4, 0.2, 2, 1), quadratic(box((0.4, 0.3, 0.2), (2, 1, 1)))
 
@@ -30,5 +27,5 @@ def test_bodies_are_joined_with_their_sets(body):
 def test_what_cannot_be_joined_or_moved_is_refused():
     with one_line("differ in dimension"):
         join(*BODIES)
-    with one_line("expected 2 finite numbers"):
+    with one_line(r"expected .2,"):
         translate(BODIES[0], 1.0)

@@ -10,10 +10,9 @@ from calls import one_line
 
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.terms import creature
-from dln_jax.softbody.terms.contact import plane_contact
+from dln_jax.softbody.terms.contact import penalty, penalty_force, plane_contact
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
-from dln_jax.softbody.terms.penalty import penalty, penalty_force
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.springs import muscles, springs
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.softbody.terms.term import Context
@@ -357,7 +356,6 @@ def test_mistakes_are_named():
         (lambda: springs(np.zeros((0, 2), int), stiffness=1.0), "leave the term out"),
         (lambda: driven(None), "muscles got no control; expected shape .3,."),
         (lambda: driven(np.ones(2)), "a control of shape .2,.; expected shape .3,."),
-        (lambda: gravity(3), "no acceleration"),
         (lambda: plane(normal=(0, 0)), "normal of a plane is zero"),
         (lambda: plane(width=-0.1), "width is -0.1"),
         (lambda: creature.creature_terms(MESHES[3], PAIRS, bumps=flat), "have 1 components; expected 2"),

@@ -15,7 +15,7 @@ from dln_jax.softbody.scene import make_scene, with_parameters
 from dln_jax.softbody.step import make_step, positions_and_convergence
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.springs import muscles
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.elements.linear_solvers import dense

@@ -16,10 +16,8 @@ from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.shapes import beam, disc
 from dln_jax.softbody.scene import element_energies, make_scene, potential, prepare, with_parameters
 from dln_jax.softbody.step import make_step
-from dln_jax.softbody.terms.contact import plane_contact
-from dln_jax.softbody.terms.damping import mass_damping, stiffness_damping
-from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.penalty import damping_of_restitution
+from dln_jax.softbody.terms.contact import damping_of_restitution, plane_contact
+from dln_jax.softbody.terms.elasticity import elastic, mass_damping, stiffness_damping
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.elements.energies import value
 

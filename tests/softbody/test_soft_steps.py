@@ -17,14 +17,12 @@ from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
 from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.integrators import BDF2, INTEGRATORS, MIDPOINT
 from dln_jax.softbody.mesh.mesh import make_mesh
-from dln_jax.softbody.mesh.placement import join, translate
-from dln_jax.softbody.mesh.quadratic import quadratic
-from dln_jax.softbody.mesh.shapes import beam, lattice
+from dln_jax.softbody.mesh.shapes import beam, join, lattice, quadratic, translate
 from dln_jax.softbody.scene import make_scene, with_parameters
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.fibres import fibres
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.springs import springs
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 

@@ -11,7 +11,7 @@ from dln_jax.softbody.integrators import BDF2, MIDPOINT
 from dln_jax.softbody.mesh.shapes import beam
 from dln_jax.softbody.scene import make_scene, with_parameters
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.softbody.ties import Tie, make_tied_step
 

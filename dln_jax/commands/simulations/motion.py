@@ -20,8 +20,8 @@ from dln_jax.metrics.soft_body_energies import motion_energies
 from dln_jax.rollout import rollout
 from dln_jax.runs.progress import progress
 from dln_jax.runs.report import png
+from dln_jax.softbody.contact.crossings import count_overlaps
 from dln_jax.softbody.driven import Example, drive
-from dln_jax.softbody.mesh.intersections import count_overlaps
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.simplices import volume_ratios
 from dln_jax.softbody.scene import Params, State
@@ -93,7 +93,7 @@ def run_motion(prepared: PreparedScene, precision: Any) -> SimulatedMotion:
     x, v, info = jax.tree.map(lambda *chunks: np.concatenate(chunks)[:steps], *seen)
     x, v = (np.concatenate([np.asarray(first)[None], rest]) for first, rest in ((start.x, x), (start.v, v)))
     count = None if example.scene.contacts else count_overlaps(example.scene.mesh)
-    overlaps = None if count is None else np.asarray(jax.jit(lambda x: jax.lax.map(count, x))(x[1:]))
+    overlaps = None if count is None else np.array([count(at) for at in x[1:]])
     return SimulatedMotion(dt * np.arange(steps + 1), x, v, info, compiled, done / spent, overlaps)
 
 

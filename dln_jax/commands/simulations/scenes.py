@@ -17,12 +17,10 @@ from dln_jax.softbody.driven import Example, driven_step
 from dln_jax.softbody.examples import EXAMPLES
 from dln_jax.softbody.integrators import INTEGRATORS
 from dln_jax.softbody.mesh.files import require_meshio
-from dln_jax.softbody.mesh.mesh import Mesh, components, overlaps
-from dln_jax.softbody.mesh.sets import values_by_set, vertices_in
+from dln_jax.softbody.mesh.mesh import Mesh, components, overlaps, values_by_set, vertices_in
 from dln_jax.softbody.mesh.surfaces import facet_points, facets_in, inner_surface
 from dln_jax.softbody.step import Stepper
-from dln_jax.softbody.terms.loads import point_force, traction
-from dln_jax.softbody.terms.pressure import pressure
+from dln_jax.softbody.terms.loads import point_force, pressure, traction
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.softbody.terms.term import Term
 from dln_jax.types import InputError, require_positive

@@ -11,15 +11,63 @@ zero, so bodies never touch. Nearly parallel edges are mollified, because the cl
 for edges u, v, which are U, V in the rest shape. Derivatives are written by hand, which compiles several times faster.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.contact.distances import Stencil, closest, summed
+from dln_jax.softbody.mesh.mesh import Mesh
+from dln_jax.softbody.terms.contact import Slip, friction_energy
+from dln_jax.softbody.terms.term import NOT_NEGATIVE, POSITIVE, Context, Numbers, Pose, material
+from dln_jax.solvers.elements.moving import Elements, MovingEnergy
 
 MOLLIFIED = 1e-3
 """Contact of edges is mollified below this squared sine of the angle between them (Li et al. 2020, section 5)."""
+
+
+class ContactParameters(NamedTuple):
+    """Parameters of a barrier contact."""
+
+    distance: Float[Array, ""]
+    """h in m; surfaces repel each other when closer."""
+    stiffness: Float[Array, ""]
+    """kappa in Pa."""
+    friction: Float[Array, ""] | None
+    """Coulomb's coefficient, or `None`."""
+    shape: Any = None
+    """The obstacle; `None` between bodies."""
+
+    @property
+    def pose(self) -> Pose | None:
+        """Pose of the obstacle; `None` without friction."""
+        return None if self.friction is None or self.shape is None else self.shape.pose
+
+
+class Contact(NamedTuple):
+    """A contact of a scene."""
+
+    name: str
+    """Key of its parameters in `Params.terms`; unique in a scene."""
+    parameters: Any
+    """Default parameters: a NamedTuple of arrays."""
+    energies: tuple[MovingEnergy, ...]
+    """The barrier and, with a coefficient of friction, the friction."""
+    prepare: Callable[[Any, Context], tuple[Any, ...]]
+    """(parameters, context) -> data of the energies in a step."""
+    least_distance: Callable[[Float[Array, "n dim"], Elements, Any], Float[Array, ""]]
+    """(positions, elements and data of the barrier) -> smallest distance in m, capped at h."""
+    mesh: Mesh | None = None
+    """As in `Term`."""
+    changing: bool = True
+    """Whether the set of elements changes during a motion."""
+
+    @property
+    def friction(self) -> tuple[MovingEnergy, ...]:
+        """The friction energy, if the contact has one."""
+        return self.energies[1:]
 
 
 class Pair(NamedTuple):
@@ -32,6 +80,18 @@ class Pair(NamedTuple):
     """h² in m²."""
     parallel: Float[Array, "*pairs"]
     """epsilon in m⁴ of two edges; zero for other pairs, which are not mollified."""
+
+
+def contact_parameters(
+    distance: float, stiffness: Numbers, friction: Numbers | None, shape: Any = None
+) -> ContactParameters:
+    """Returns validated parameters."""
+    return ContactParameters(
+        jnp.asarray(distance, dtype=float),
+        material("the stiffness of a contact", stiffness, 1, "contact", POSITIVE),
+        None if friction is None else material("friction", friction, 1, "contact", NOT_NEGATIVE),
+        shape,
+    )
 
 
 def barrier(D: Float[Array, "*pairs"], near: Float[Array, "*pairs"]) -> tuple[Array, Array, Array]:
@@ -108,3 +168,24 @@ def _mollifier(x: Float[Array, "4 3"], parallel: Float[Array, ""]) -> tuple[Arra
         first * gradient,
         second * flat[:, None] * flat + first * curved,
     )
+
+
+def _sliding_energy(x: Float[Array, "k dim"], data: tuple[Slip, Array]) -> Float[Array, ""]:
+    slip, weights = data
+    return friction_energy(weights @ x, slip)
+
+
+def _sliding_hessian(x: Float[Array, "k dim"], data: tuple[Slip, Array]) -> Float[Array, "s s"]:
+    slip, weights = data
+    of_point = jax.hessian(lambda point: friction_energy(point, slip))(weights @ x)
+    return jnp.einsum("a,ij,b->aibj", weights, of_point, weights).reshape(x.size, x.size)
+
+
+SLIDING = MovingEnergy(
+    elements=lambda x, step, data: data[0],
+    describe=lambda x, elements, data: data[1],
+    gradient=jax.value_and_grad(_sliding_energy),
+    hessian=_sliding_hessian,
+    longest=lambda x, step, elements, data: jnp.ones((), x.dtype),
+)
+"""Friction of points that are weighted sums of vertices; its data are the elements, and their slips and weights."""

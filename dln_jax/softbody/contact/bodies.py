@@ -18,16 +18,41 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
-from dln_jax.softbody.contact.barrier import MOLLIFIED, Pair, normal_force, pair_gradient, pair_hessian
-from dln_jax.softbody.contact.candidates import Group, boxes, group, meeting, meetings, pairs_near, places
-from dln_jax.softbody.contact.contact import Contact, ContactParameters, contact_parameters
-from dln_jax.softbody.contact.continuous_collision import longest_step, speed_bound
-from dln_jax.softbody.contact.distances import EDGE_EDGE, POINT_TRIANGLE, squared_distance, stencil_of
-from dln_jax.softbody.contact.surface import Surface, areas, surface_of
+from dln_jax.softbody.contact.barrier import (
+    MOLLIFIED,
+    SLIDING,
+    Contact,
+    ContactParameters,
+    Pair,
+    contact_parameters,
+    normal_force,
+    pair_gradient,
+    pair_hessian,
+)
+from dln_jax.softbody.contact.candidates import (
+    Group,
+    Surface,
+    areas,
+    boxes,
+    group,
+    meeting,
+    meetings,
+    pairs_near,
+    places,
+    surface_of,
+)
+from dln_jax.softbody.contact.distances import (
+    EDGE_EDGE,
+    POINT_TRIANGLE,
+    longest_step,
+    speed_bound,
+    squared_distance,
+    stencil_of,
+)
 from dln_jax.softbody.mesh.mesh import Mesh, components_of_vertices
-from dln_jax.softbody.terms.contact import Slip, friction_energy, slip_of
+from dln_jax.softbody.terms.contact import Slip, slip_of
 from dln_jax.softbody.terms.term import Context, Numbers
 from dln_jax.solvers.elements.moving import Elements, MovingEnergy
 from dln_jax.types import InputError, require_positive
@@ -45,17 +70,6 @@ class Kind(NamedTuple):
     """Number of the kind in `distances`."""
     neighbours: tuple[int, int]
     """Number of pairs of clusters, and of primitives, whose boxes meet in the rest shape."""
-
-
-class Listed(NamedTuple):
-    """A list of pairs, without derivatives."""
-
-    pairs: Int[Array, "capacity 2"]
-    """Indices of the primitives."""
-    kind: Int[Array, " capacity"]
-    """Number of the kind in `distances`."""
-    used: Bool[Array, " capacity"]
-    """False for unused slots."""
 
 
 def body_contact(
@@ -97,13 +111,6 @@ def body_contact(
         hessian=pair_hessian,
         longest=_longest,
     )
-    sliding = MovingEnergy(
-        elements=lambda x, step, data: data[0],
-        describe=lambda x, elements, data: data[1],
-        gradient=jax.value_and_grad(_sliding_energy),
-        hessian=_sliding_hessian,
-        longest=lambda x, step, elements, data: jnp.ones((), x.dtype),
-    )
 
     def prepare(parameters: ContactParameters, context: Context) -> tuple[Any, ...]:
         data = (parameters, context.rest)
@@ -112,11 +119,12 @@ def body_contact(
         return data, _lagged(barrier, parameters.friction, data, context, threshold_speed)
 
     def least_distance(x: Float[Array, "n dim"], elements: Elements, data: Any) -> Float[Array, ""]:
-        squares = jax.vmap(squared_distance)(x[elements.indices], elements.data.kind)
+        _, kind, used = elements.data
+        squares = jax.vmap(squared_distance)(x[elements.indices], kind)
         farthest = data[0].distance ** 2
-        return jnp.sqrt(jnp.minimum(jnp.min(jnp.where(elements.data.used, squares, farthest)), farthest))
+        return jnp.sqrt(jnp.minimum(jnp.min(jnp.where(used, squares, farthest)), farthest))
 
-    energies = (barrier,) if friction is None else (barrier, sliding)
+    energies = (barrier,) if friction is None else (barrier, SLIDING)
     return Contact(name, parameters, energies, prepare, least_distance, mesh)
 
 
@@ -126,9 +134,9 @@ def _kinds(surface: Surface, rest: np.ndarray, distance: float) -> tuple[Kind, .
     def kind(one: Group, other: Group, number: int) -> Kind:
         return Kind(one, other, number, meetings(one, other, rest, distance))
 
-    if surface.dimension == 2:
+    if surface.sides is None:
         return (kind(vertices, edges, 0),)
-    triangles = group(surface.triangles, rest)
+    triangles = group(surface.facets, rest)
     return kind(vertices, triangles, POINT_TRIANGLE), kind(edges, edges, EDGE_EDGE)
 
 
@@ -151,7 +159,10 @@ def _require_gaps(mesh: Mesh, kinds: tuple[Kind, ...], distance: float) -> None:
 
 
 def _near(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, data: Any) -> Elements:
-    """Lists the pairs that come within h of each other between x and x + step."""
+    """Lists the pairs that come within h of each other between x and x + step.
+
+    The data of a slot are the two primitives, the number of its kind in `distances`, and whether it is used.
+    """
     parameters, _ = data
     lists = []
     for kind in kinds:
@@ -160,15 +171,17 @@ def _near(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, data: A
         of_other = of_one if kind.one is kind.other else boxes(kind.other, x, x + step, margin)
         # Boxes of neighbours in one surface always meet, so these lists are longer than those of near pairs.
         clusters, primitives = (count + count // 2 + 2 * capacity for count in kind.neighbours)
-        lists.append(pairs_near(kind.one, kind.other, of_one, of_other, (clusters, primitives)))
-    pairs, used = (jnp.concatenate(parts) for parts in zip(*(listed[:2] for listed in lists), strict=True))
-    number = np.concatenate([np.full(len(of.used), kind.number) for kind, of in zip(kinds, lists, strict=True)])
-    corners = jnp.concatenate([_corners(kind, of.pairs) for kind, of in zip(kinds, lists, strict=True)])
+        pairs, used, overflow = pairs_near(kind.one, kind.other, of_one, of_other, (clusters, primitives))
+        ends = jnp.asarray(kind.one.primitives)[pairs[:, 0]], jnp.asarray(kind.other.primitives)[pairs[:, 1]]
+        lists.append((pairs, used, overflow, np.full(len(used), kind.number), jnp.concatenate(ends, axis=1)))
+    pairs, used, overflows, numbers, corners = zip(*lists, strict=True)
+    pairs, used, corners = (jnp.concatenate(parts) for parts in (pairs, used, corners))
+    number = np.concatenate(numbers)
     near = used & _within_reach(x, step, corners, number, used, parameters.distance)
     chosen, here, too_many = places(near, capacity * len(kinds))
     indices = jnp.where(here[:, None], corners[chosen], jnp.arange(corners.shape[1]))
-    overflow = jnp.stack([too_many, *(listed.overflow for listed in lists)]).any()
-    return Elements(indices, Listed(pairs[chosen], jnp.asarray(number)[chosen], here), overflow)
+    overflow = jnp.stack([too_many, *overflows]).any()
+    return Elements(indices, (pairs[chosen], jnp.asarray(number)[chosen], here), overflow)
 
 
 def _within_reach(x: Array, step: Array, corners: Array, number: np.ndarray, used: Array, distance: Array) -> Array:
@@ -188,19 +201,15 @@ def _within_reach(x: Array, step: Array, corners: Array, number: np.ndarray, use
     return jax.lax.fori_loop(0, -(-used.sum() // _AT_ONCE), measure, jnp.zeros_like(used))
 
 
-def _corners(kind: Kind, pairs: Int[Array, "m 2"]) -> Int[Array, "m k"]:
-    one, other = jnp.asarray(kind.one.primitives), jnp.asarray(kind.other.primitives)
-    return jnp.concatenate([one[pairs[:, 0]], other[pairs[:, 1]]], axis=1)
-
-
 def _described(surface: Surface, x: Array, elements: Elements, data: Any) -> Pair:
     """Returns the data of all listed pairs for the barrier at x."""
     parameters, rest = data
-    (one, other), number, used = elements.data.pairs.T, elements.data.kind, elements.data.used
+    pairs, number, used = elements.data
+    one, other = pairs.T
     of_vertices, of_edges = areas(surface, rest)
     stencil = jax.vmap(stencil_of)(jax.lax.stop_gradient(x[elements.indices]), number)
     # A pair of facets is counted from both sides: in space by vertices and by edges (Li et al. 2023, section 4).
-    if surface.dimension == 2:
+    if surface.sides is None:
         area, parallel = of_vertices[one] / 2, jnp.zeros_like(rest, shape=one.shape)
     else:
         a, b, c, d = (rest[corner] for corner in elements.indices.T)
@@ -213,13 +222,13 @@ def _described(surface: Surface, x: Array, elements: Elements, data: Any) -> Pai
 
 def _longest(x: Array, step: Array, elements: Elements, data: Any) -> Array:
     """Returns the largest fraction of the step without a crossing of a listed pair."""
-    at, moved, number = x[elements.indices], step[elements.indices], elements.data.kind
+    at, moved, (_, number, used) = x[elements.indices], step[elements.indices], elements.data
 
     def distances(t: Array) -> Array:
         return jnp.sqrt(jax.vmap(squared_distance)(at + t[:, None, None] * moved, number))
 
     bound = jax.vmap(speed_bound)(moved, number)
-    return longest_step(distances, jnp.where(elements.data.used, bound, 0))
+    return longest_step(distances, jnp.where(used, bound, 0))
 
 
 def _lagged(
@@ -232,14 +241,3 @@ def _lagged(
     force, normal, weights = jax.vmap(normal_force)(corners, barrier.describe(x, elements, data))
     start = jnp.einsum("mk,mki->mi", weights, context.x[elements.indices])
     return elements, (slip_of(context, threshold_speed, start, normal, friction * force), weights)
-
-
-def _sliding_energy(x: Float[Array, "k dim"], data: tuple[Slip, Array]) -> Float[Array, ""]:
-    slip, weights = data
-    return friction_energy(weights @ x, slip)
-
-
-def _sliding_hessian(x: Float[Array, "k dim"], data: tuple[Slip, Array]) -> Float[Array, "s s"]:
-    slip, weights = data
-    of_point = jax.hessian(lambda point: friction_energy(point, slip))(weights @ x)
-    return jnp.einsum("a,ij,b->aibj", weights, of_point, weights).reshape(x.size, x.size)

@@ -1,19 +1,44 @@
-"""Broad phase: lists, of fixed capacity, of primitives that may come near each other.
+"""The contact surface of a body, and lists, of fixed capacity, of its primitives that may come near each other.
+
+The facets of a quadratic mesh are divided at their mid-side nodes, into 2 edges in the plane and 4 triangles in space,
+so all nodes are in contact, on a surface that is linear between them.
 
 Primitives are grouped once into clusters of neighbours in the rest shape, which stay neighbours while the body deforms.
 The bounding boxes of clusters are compared first, then those of the primitives in clusters that meet. A list that is
 too short is reported, never silently cut off.
 """
 
+import functools
+import itertools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
+
+from dln_jax.softbody.mesh.mesh import Mesh, boundary
+from dln_jax.softbody.mesh.surfaces import facet_nodes
 
 CLUSTER = 8
 """Number of primitives that share one bounding box."""
+Boxes = tuple[Float[Array, "*m dim"], Float[Array, "*m dim"]]
+"""Lowest and highest corners of bounding boxes, in m."""
+_PARTS = {3: ((0, 2), (2, 1)), 6: ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))}
+"""Parts of a quadratic facet by its number of nodes, with the facet's orientation."""
+
+
+class Surface(NamedTuple):
+    """Primitives of the boundary, as vertex indices."""
+
+    vertices: Int[np.ndarray, " v"]
+    edges: Int[np.ndarray, "e 2"]
+    facets: Int[np.ndarray, "f dim"]
+    """The edges in the plane, triangles in space."""
+    sides: Int[np.ndarray, "f 3"] | None
+    """Edges of every triangle; `None` in the plane."""
 
 
 class Group(NamedTuple):
@@ -25,22 +50,33 @@ class Group(NamedTuple):
     """Indices of the primitives in every cluster; -1 for an empty slot."""
 
 
-class Boxes(NamedTuple):
-    """Bounding boxes in m."""
+def surface_of(mesh: Mesh) -> Surface:
+    """Returns the boundary of a mesh."""
+    facets = boundary(mesh)
+    if mesh.midsides is not None:
+        nodes = facet_nodes(mesh, facets)
+        facets = nodes[:, np.array(_PARTS[nodes.shape[1]])].reshape(-1, mesh.dimension)
+    if mesh.dimension == 2:
+        edges = np.sort(facets, axis=1)
+        return Surface(np.unique(facets), edges, edges, None)
+    pairs = np.sort(facets[:, list(itertools.combinations(range(3), 2))], axis=2)
+    edges, sides = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
+    return Surface(np.unique(facets), edges, facets, sides.reshape(-1, 3))
 
-    low: Float[Array, "*m dim"]
-    high: Float[Array, "*m dim"]
 
+def areas(surface: Surface, rest: Float[Array, "n dim"]) -> tuple[Float[Array, " v"], Float[Array, " e"]]:
+    """Returns the areas of vertices and edges in m²: each gets a third of the areas of its triangles.
 
-class PairList(NamedTuple):
-    """A list of pairs of primitives."""
-
-    pairs: Int[Array, "capacity 2"]
-    """Indices of the primitives."""
-    used: Bool[Array, " capacity"]
-    """False for unused slots."""
-    overflow: Bool[Array, ""]
-    """Whether there are more pairs than slots."""
+    In the plane, for a thickness of 1 m, a vertex gets half the lengths of its edges and an edge its length.
+    """
+    first, second, *third = (rest[corner] for corner in surface.facets.T)
+    if third:
+        share = jnp.linalg.norm(jnp.cross(second - first, third[0] - first), axis=1) / 6
+        of_edges = jnp.zeros(len(surface.edges), rest.dtype).at[surface.sides].add(share[:, None])
+    else:
+        of_edges = jnp.linalg.norm(second - first, axis=1)
+        share = of_edges / 2
+    return jnp.zeros(len(rest), rest.dtype).at[surface.facets].add(share[:, None])[surface.vertices], of_edges
 
 
 def group(primitives: Int[np.ndarray, "m k"], rest: Float[np.ndarray, "n dim"]) -> Group:
@@ -64,17 +100,19 @@ def group(primitives: Int[np.ndarray, "m k"], rest: Float[np.ndarray, "n dim"]) 
 def boxes(of: Group, x: Float[Array, "n dim"], end: Float[Array, "n dim"], margin: Array | float) -> Boxes:
     """Returns the boxes that primitives sweep from x to `end`, enlarged by a margin in m."""
     low, high = jnp.minimum(x, end)[of.primitives], jnp.maximum(x, end)[of.primitives]
-    return Boxes(low.min(axis=1) - margin, high.max(axis=1) + margin)
+    return low.min(axis=1) - margin, high.max(axis=1) + margin
 
 
-def meeting(one: Boxes, other: Boxes) -> Int[np.ndarray, "m 2"]:
-    """Returns the pairs of known boxes that meet, by rows of the first."""
+def meeting(one: tuple[ArrayLike, ArrayLike], other: tuple[ArrayLike, ArrayLike]) -> Int[np.ndarray, "m 2"]:
+    """Returns the pairs of known boxes (low, high) that meet, by rows of the first."""
     (low, high), (other_low, other_high) = (map(np.asarray, side) for side in (one, other))
-    rows = [
-        np.flatnonzero((bottom <= other_high).all(axis=1) & (other_low <= top).all(axis=1))
-        for bottom, top in zip(low, high, strict=True)
-    ]
-    return np.stack([np.repeat(np.arange(len(rows)), [len(row) for row in rows]), np.concatenate(rows)], axis=1)
+    # Boxes that meet have centres no farther apart than the halves of the longest sides, and rounding.
+    reach = (np.max(high - low) + np.max(other_high - other_low)) / 2 + 1e-12 * np.abs(other_high).max()
+    trees = KDTree((low + high) / 2), KDTree((other_low + other_high) / 2)
+    columns = trees[0].query_ball_tree(trees[1], reach, p=np.inf)
+    row, column = np.repeat(np.arange(len(low)), list(map(len, columns))), np.concatenate(columns).astype(int)
+    meet = (low[row] <= other_high[column]) & (other_low[column] <= high[row])
+    return np.stack([row, column], axis=1)[meet.all(axis=1)]
 
 
 def meetings(one: Group, other: Group, x: Float[np.ndarray, "n dim"], margin: float) -> tuple[int, int]:
@@ -84,8 +122,10 @@ def meetings(one: Group, other: Group, x: Float[np.ndarray, "n dim"], margin: fl
     return len(meeting(_of_clusters(one, first), _of_clusters(other, second))), len(meeting(first, second))
 
 
-def pairs_near(one: Group, other: Group, of_one: Boxes, of_other: Boxes, capacity: tuple[int, int]) -> PairList:
-    """Returns the pairs of primitives without a common vertex whose boxes meet.
+def pairs_near(
+    one: Group, other: Group, of_one: Boxes, of_other: Boxes, capacity: tuple[int, int]
+) -> tuple[Int[Array, "capacity 2"], Bool[Array, " capacity"], Bool[Array, ""]]:
+    """Returns the pairs of primitives without a common vertex whose boxes meet, which slots are used, and overflow.
 
     Args:
         one, other: the primitives; pairs within one group are listed once.
@@ -105,35 +145,30 @@ def pairs_near(one: Group, other: Group, of_one: Boxes, of_other: Boxes, capacit
         present &= (row != column)[:, None, None] | (first[:, :, None] < second[:, None, :])
     corners, others = jnp.asarray(one.primitives)[first], jnp.asarray(other.primitives)[second]
     shared = (corners[:, :, None, :, None] == others[:, None, :, None, :]).any(axis=(3, 4))
-    near = _meet(*(Boxes(*(side[number] for side in box)) for box, number in ((of_one, first), (of_other, second))))
+    near = _meet((of_one[0][first], of_one[1][first]), (of_other[0][second], of_other[1][second]))
     place, taken, too_many = places(near & present & ~shared, capacity[1])
     cluster, i, j = jnp.unravel_index(place, near.shape)
-    return PairList(jnp.stack([first[cluster, i], second[cluster, j]], axis=1), taken, too_many | too_many_clusters)
+    return jnp.stack([first[cluster, i], second[cluster, j]], axis=1), taken, too_many | too_many_clusters
 
 
 def _of_clusters(of: Group, box: Boxes) -> Boxes:
     members, empty = jnp.asarray(of.clusters), (of.clusters < 0)[:, :, None]
-    low = jnp.where(empty, jnp.inf, box.low[members]).min(axis=1)
-    return Boxes(low, jnp.where(empty, -jnp.inf, box.high[members]).max(axis=1))
+    low = jnp.where(empty, jnp.inf, box[0][members]).min(axis=1)
+    return low, jnp.where(empty, -jnp.inf, box[1][members]).max(axis=1)
 
 
 def _meet(one: Boxes, other: Boxes) -> Bool[Array, "*batch one other"]:
     """Whether boxes meet, for all pairs along their last batch axis."""
-
-    def axis(i: int) -> Array:
-        return (one.low[..., :, None, i] <= other.high[..., None, :, i]) & (
-            other.low[..., None, :, i] <= one.high[..., :, None, i]
-        )
-
-    meets = axis(0)
-    for i in range(1, one.low.shape[-1]):
-        meets &= axis(i)
-    return meets
+    (low, high), (other_low, other_high) = one, other
+    axes = range(low.shape[-1])
+    before = [low[..., :, None, i] <= other_high[..., None, :, i] for i in axes]
+    after = [other_low[..., None, :, i] <= high[..., :, None, i] for i in axes]
+    return functools.reduce(jnp.logical_and, before + after)
 
 
 def places(mask: Bool[Array, "..."], capacity: int) -> tuple[Int[Array, " capacity"], Bool[Array, " capacity"], Array]:
     """Returns the flat indices where the mask is true, which slots are used, and whether some had to be left out."""
-    # Binary searches in the running counts of 32-bit words, then in a word: several times faster than `nonzero`.
+    # A binary search in the running counts of 32-bit words: several times faster than `nonzero`.
     flat = mask.reshape(-1)
     rows = jnp.pad(flat, (0, -len(flat) % 32)).reshape(-1, 32)
     words = jnp.sum(rows.astype(jnp.uint32) << jnp.arange(32, dtype=jnp.uint32), axis=1, dtype=jnp.uint32)
@@ -142,10 +177,9 @@ def places(mask: Bool[Array, "..."], capacity: int) -> tuple[Int[Array, " capaci
     number = jnp.arange(capacity, dtype=jnp.int32)
     used = number < running[-1]
     at = jnp.minimum(jnp.searchsorted(running, number, side="right"), len(words) - 1)
-    word, rank, place = words[at], number - running[at] + counts[at], jnp.zeros(capacity, jnp.int32)
-    for half in (16, 8, 4, 2, 1):
-        low = jax.lax.population_count(word & jnp.uint32(2**half - 1)).astype(jnp.int32)
-        beyond = rank >= low
-        rank, place = rank - jnp.where(beyond, low, 0), place + jnp.where(beyond, half, 0)
-        word = jnp.where(beyond, word >> half, word)
+    # The place in a word is the number of its beginnings that hold no more bits than the rank.
+    beginnings = words[at, None] & jnp.asarray(2 ** np.arange(1, 33) - 1, jnp.uint32)
+    rank = number - running[at] + counts[at]
+    held = jax.lax.population_count(beginnings).astype(jnp.int32)
+    place = jnp.sum(held <= rank[:, None], axis=1, dtype=jnp.int32)
     return jnp.where(used, at * 32 + place, 0), used, running[-1] > capacity

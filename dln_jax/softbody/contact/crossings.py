@@ -1,22 +1,23 @@
-"""Exact test for crossing surfaces: edges that cross in the plane, edges that cross triangles in space.
+"""Exact test for crossing surfaces, and overlapping bodies: edges that cross in the plane, or triangles in space.
 
 Orientation determinants of float64 coordinates are evaluated in rational arithmetic where rounding could change a sign.
 """
 
 import itertools
+from collections.abc import Callable
 from fractions import Fraction
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dln_jax.softbody.contact.candidates import boxes, group, meeting
-from dln_jax.softbody.contact.surface import surface_of
-from dln_jax.softbody.mesh.mesh import Mesh
+from dln_jax.softbody.contact.candidates import meeting, surface_of
+from dln_jax.softbody.mesh.mesh import Mesh, components_of_vertices
 
 _ROUNDING = 1e-14
 """Rounding error of a determinant relative to the sum of the absolute values of its products: 20 units of rounding."""
+_AWAY = np.array([1.0, 0.618, 0.414])
+"""Direction of a ray out of a box, which passes through no vertex or edge of common meshes."""
 
 
 def crossings(mesh: Mesh, x: Float[np.ndarray, "n dim"]) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
@@ -26,17 +27,45 @@ def crossings(mesh: Mesh, x: Float[np.ndarray, "n dim"]) -> list[tuple[tuple[int
     triangles in space cross, an edge of one crosses the other.
     """
     surface = surface_of(mesh)
-    x = np.asarray(x, float)
-    others = surface.edges if mesh.dimension == 2 else surface.triangles
-    at = jnp.asarray(x)
-    one, other = meeting(*(boxes(group(of, x), at, at, 0.0) for of in (surface.edges, others))).T
-    if mesh.dimension == 2:
+    return _crossing(np.asarray(x, float), surface.edges, surface.facets)
+
+
+def count_overlaps(mesh: Mesh) -> Callable[[Float[np.ndarray, "n dim"]], int] | None:
+    """Returns positions -> number of pairs of components that touch or overlap; `None` for a mesh of one component."""
+    label = components_of_vertices(mesh)
+    _, edges, facets, _ = surface_of(mesh)
+    owners = label[facets[:, 0]]
+    _, first = np.unique(label, return_index=True)
+    if len(first) == 1:
+        return None
+
+    def count(x: Float[np.ndarray, "n dim"]) -> int:
+        x = np.asarray(x, float)
+        if not np.isfinite(x).all():
+            return 0
+        met = {frozenset((label[one[0]], label[other[0]])) for one, other in _crossing(x, edges, facets)}
+        far = x.max(axis=0) + np.ptp(x, axis=0) * _AWAY[: mesh.dimension]
+        for part, vertex in enumerate(first):
+            # A ray from a point inside a closed surface crosses it an odd number of times.
+            rays = np.broadcast_to([x[vertex], far], (len(facets), 2, mesh.dimension))
+            odd = np.bincount(owners[_MEET[mesh.dimension](rays, x[facets])], minlength=len(first)) % 2
+            met |= {frozenset((part, other)) for other in np.flatnonzero(odd)}
+        return sum(len(pair) == 2 for pair in met)
+
+    return count
+
+
+def _crossing(
+    x: Float[np.ndarray, "n dim"], edges: Int[np.ndarray, "e 2"], facets: Int[np.ndarray, "f dim"]
+) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """Returns the edges and facets that have a common point, but no common vertex; pairs of edges once."""
+    one, other = meeting(*((x[of].min(axis=1), x[of].max(axis=1)) for of in (edges, facets))).T
+    if x.shape[1] == 2:
         one, other = one[one < other], other[one < other]
-    edges, facets = surface.edges[one], others[other]
+    edges, facets = edges[one], facets[other]
     apart = ~(edges[:, :, None] == facets[:, None, :]).any(axis=(1, 2))
     edges, facets = edges[apart], facets[apart]
-    meet = _segments_meet if mesh.dimension == 2 else _segments_meet_triangles
-    hit = meet(x[edges], x[facets])
+    hit = _MEET[x.shape[1]](x[edges], x[facets])
     return [(tuple(edge), tuple(facet)) for edge, facet in zip(edges[hit].tolist(), facets[hit].tolist(), strict=True)]
 
 
@@ -100,3 +129,7 @@ def _determinants(rows: np.ndarray) -> tuple[Any, Any]:
         swaps = sum(i > j for i, j in itertools.combinations(order, 2))
         value, size = value + (-1) ** swaps * product, size + abs(product)
     return value, size
+
+
+_MEET = {2: _segments_meet, 3: _segments_meet_triangles}
+"""Test of an edge and a facet by dimension."""

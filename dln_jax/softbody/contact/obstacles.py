@@ -6,50 +6,26 @@ with the signed distance d of a vertex to the obstacle, positive outside, and b 
 steps of the minimisation, so that no vertex enters an obstacle, however fast it is. Only vertices are in contact: an
 obstacle smaller than the triangles of a body can pass between them. Model it as a held body in a `body_contact`.
 
-A distance function must not overestimate the distance (its slope is at most 1) and must be twice differentiable almost
-everywhere outside the obstacle. To move an obstacle, change its parameters from step to step, by less than the gap;
-friction takes its velocity from the change of its pose.
+An obstacle is a NamedTuple of differentiable arrays with a method `distance`: position in m -> signed distance in m. It
+must not overestimate the distance (its slope is at most 1) and must be twice differentiable almost everywhere outside
+the obstacle. With friction, an obstacle also has the property `pose` (`terms.term`). To move an obstacle, change its
+parameters from step to step, by less than the gap; friction takes its velocity from the change of its pose.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dln_jax.softbody.contact.barrier import barrier
-from dln_jax.softbody.contact.contact import Contact, ContactParameters, contact_parameters
-from dln_jax.softbody.contact.continuous_collision import longest_step
-from dln_jax.softbody.contact.surface import areas, surface_of
+from dln_jax.softbody.contact.barrier import SLIDING, Contact, ContactParameters, barrier, contact_parameters
+from dln_jax.softbody.contact.candidates import areas, surface_of
+from dln_jax.softbody.contact.distances import longest_step
 from dln_jax.softbody.mesh.mesh import Mesh
-from dln_jax.softbody.terms.contact import Slip, friction_energy, motion_of, plane_pose, slip_of
+from dln_jax.softbody.terms.contact import motion_of, plane_pose, slip_of
 from dln_jax.softbody.terms.term import Context, Numbers, Pose, vector
 from dln_jax.solvers.elements.moving import Elements, MovingEnergy
 from dln_jax.types import InputError, require_positive
-
-Distance = Callable[[Float[Array, " dim"], Any], Float[Array, ""]]
-"""(position in m, parameters of the shape) -> signed distance in m."""
-
-
-class Obstacle(NamedTuple):
-    """A rigid shape: its distance function and parameters."""
-
-    distance: Distance
-    shape: Any
-    """Parameters: a NamedTuple of arrays, differentiable. With friction it has the property `pose` (`terms.term`)."""
-
-
-class ObstacleParameters(NamedTuple):
-    """Parameters of the contact with an obstacle."""
-
-    contact: ContactParameters
-    shape: Any
-
-    @property
-    def pose(self) -> Pose | None:
-        """Pose of the shape; `None` without friction."""
-        return None if self.contact.friction is None else self.shape.pose
 
 
 class HalfSpace(NamedTuple):
@@ -64,6 +40,10 @@ class HalfSpace(NamedTuple):
     def pose(self) -> Pose:
         """As in `PlaneContact`."""
         return plane_pose(self.normal, self.offset)
+
+    def distance(self, x: Array) -> Array:
+        """Exact."""
+        return jnp.sum(x * self.normal) / jnp.linalg.norm(self.normal) - self.offset
 
 
 class Capsule(NamedTuple):
@@ -81,6 +61,13 @@ class Capsule(NamedTuple):
         squared = jnp.sum(along**2)
         return self.start, along[None] / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
 
+    def distance(self, x: Array) -> Array:
+        """Exact."""
+        along, w = self.end - self.start, x - self.start
+        squared = jnp.sum(along**2)
+        s = jnp.clip(jnp.sum(w * along) / jnp.where(squared > 0, squared, 1.0), 0.0, 1.0)
+        return jnp.linalg.norm(w - s * along) - self.radius
+
 
 class Box(NamedTuple):
     """A box whose sides point along the rows of a rotation."""
@@ -95,6 +82,13 @@ class Box(NamedTuple):
     def pose(self) -> Pose:
         """Centre and sides."""
         return self.centre, self.rotation
+
+    def distance(self, x: Array) -> Array:
+        """Exact."""
+        beyond = jnp.abs(self.rotation @ (x - self.centre)) - self.half_lengths
+        squared = jnp.sum(jnp.maximum(beyond, 0.0) ** 2)
+        away = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
+        return jnp.where(squared > 0, away, jnp.max(beyond))
 
 
 class Heightfield(NamedTuple):
@@ -113,76 +107,53 @@ class Heightfield(NamedTuple):
         origin = jnp.pad(self.origin, (0, 1))
         return origin, jnp.zeros((0, len(origin)), origin.dtype)
 
+    def distance(self, x: Array) -> Array:
+        """At most the true distance: the height over sqrt(1 + s²), s the largest slope of the control points."""
+        at = (x[:-1] - self.origin) / self.spacing
+        ground = self.heights
+        for axis in range(ground.ndim - 1, -1, -1):
+            ground = _spline(ground, at[axis])
+        squared = sum(jnp.max(jnp.diff(self.heights, axis=i) ** 2) for i in range(self.heights.ndim))
+        return (x[-1] - ground) / jnp.sqrt(1 + squared / self.spacing**2)
 
-def half_space(normal: Numbers, offset: float = 0.0) -> Obstacle:
+
+def half_space(normal: Numbers, offset: float = 0.0) -> HalfSpace:
     """Returns the half-space n·x < offset in m, for the unit normal n."""
-
-    def distance(x: Array, shape: HalfSpace) -> Array:
-        return jnp.sum(x * shape.normal) / jnp.linalg.norm(shape.normal) - shape.offset
-
     normal = vector("the normal of a half-space", normal, zero_allowed=False)
-    return Obstacle(distance, HalfSpace(normal, jnp.asarray(offset, float)))
+    return HalfSpace(normal, jnp.asarray(offset, float))
 
 
-def capsule(start: Numbers, end: Numbers, radius: float) -> Obstacle:
+def capsule(start: Numbers, end: Numbers, radius: float) -> Capsule:
     """Returns the points within a radius in m of the segment between two points."""
     require_positive(radius=radius)
-
-    def distance(x: Array, shape: Capsule) -> Array:
-        along, w = shape.end - shape.start, x - shape.start
-        squared = jnp.sum(along**2)
-        s = jnp.clip(jnp.sum(w * along) / jnp.where(squared > 0, squared, 1.0), 0.0, 1.0)
-        return jnp.linalg.norm(w - s * along) - shape.radius
-
     first, last = vector("the start of a capsule", start), vector("the end of a capsule", end)
-    return Obstacle(distance, Capsule(first, last, jnp.asarray(radius, float)))
+    return Capsule(first, last, jnp.asarray(radius, float))
 
 
-def sphere(centre: Numbers, radius: float) -> Obstacle:
+def sphere(centre: Numbers, radius: float) -> Capsule:
     """Returns the points within a radius in m of a centre."""
     return capsule(centre, centre, radius)
 
 
-def box(centre: Numbers, half_lengths: Numbers, rotation: Any = None) -> Obstacle:
+def box(centre: Numbers, half_lengths: Numbers, rotation: Any = None) -> Box:
     """Returns a box of half lengths in m along the rows of a rotation (by default the axes)."""
     lengths = vector("the half lengths of a box", half_lengths, zero_allowed=False)
     rows = jnp.eye(len(lengths)) if rotation is None else jnp.asarray(rotation, float)
-
-    def distance(x: Array, shape: Box) -> Array:
-        beyond = jnp.abs(shape.rotation @ (x - shape.centre)) - shape.half_lengths
-        outside = jnp.maximum(beyond, 0.0)
-        squared = jnp.sum(outside**2)
-        away = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
-        return jnp.where(squared > 0, away, jnp.max(beyond))
-
-    return Obstacle(distance, Box(vector("the centre of a box", centre), lengths, rows))
+    return Box(vector("the centre of a box", centre), lengths, rows)
 
 
-def heightfield(heights: Any, origin: Numbers, spacing: float) -> Obstacle:
-    """Returns the ground below the cubic B-spline of heights in m, [k] or [k, l].
-
-    The distance, at most the true one, is the height over sqrt(1 + s²), s the largest slope of the control points.
-    """
+def heightfield(heights: Any, origin: Numbers, spacing: float) -> Heightfield:
+    """Returns the ground below the cubic B-spline of heights in m, [k] or [k, l]."""
     require_positive(spacing=spacing)
     heights = jnp.asarray(heights, float)
     if heights.ndim not in (1, 2):
         raise InputError(f"heights has shape {heights.shape}; expected [k] in the plane or [k, l] in space")
-
-    def distance(x: Array, shape: Heightfield) -> Array:
-        at = (x[:-1] - shape.origin) / shape.spacing
-        ground = shape.heights
-        for axis in range(ground.ndim - 1, -1, -1):
-            ground = _spline(ground, at[axis])
-        squared = sum(jnp.max(jnp.diff(shape.heights, axis=i) ** 2) for i in range(shape.heights.ndim))
-        return (x[-1] - ground) / jnp.sqrt(1 + squared / shape.spacing**2)
-
-    shape = Heightfield(heights, jnp.asarray(origin, float).reshape(heights.ndim), jnp.asarray(spacing, float))
-    return Obstacle(distance, shape)
+    return Heightfield(heights, jnp.asarray(origin, float).reshape(heights.ndim), jnp.asarray(spacing, float))
 
 
 def obstacle_contact(
     mesh: Mesh,
-    obstacle: Obstacle,
+    obstacle: Any,
     *,
     distance: float,
     stiffness: Numbers,
@@ -197,12 +168,12 @@ def obstacle_contact(
             a shape without a pose.
     """
     require_positive(distance=distance, threshold_speed=threshold_speed)
-    if friction is not None and not hasattr(obstacle.shape, "pose"):
-        raise InputError(f"the shape of '{name}' has no property `pose`, which friction needs (see `Obstacle.shape`)")
+    if friction is not None and not hasattr(obstacle, "pose"):
+        raise InputError(f"the obstacle '{name}' has no property `pose`, which friction needs")
     surface = surface_of(mesh)
-    parameters = ObstacleParameters(contact_parameters(distance, stiffness, friction), obstacle.shape)
-    distances = jax.vmap(obstacle.distance, (0, None))
-    inside = distances(jnp.asarray(mesh.vertices[surface.vertices]), obstacle.shape) <= 0
+    parameters = contact_parameters(distance, stiffness, friction, obstacle)
+    distances = jax.vmap(type(obstacle).distance, (None, 0))
+    inside = distances(obstacle, jnp.asarray(mesh.vertices[surface.vertices])) <= 0
     if inside.any():
         vertex = surface.vertices[int(jnp.argmax(inside))]
         raise InputError(
@@ -212,56 +183,50 @@ def obstacle_contact(
     indices = jnp.asarray(surface.vertices)[:, None]
     every = Elements(indices, (), jnp.asarray(False))
 
-    def describe(x: Array, elements: Elements, data: tuple[ObstacleParameters, Array]) -> tuple[Any, Array, Array]:
+    def describe(x: Array, elements: Elements, data: tuple[ContactParameters, Array]) -> tuple[Any, Array, Array]:
         parameters, rest = data
-        strength = parameters.contact.stiffness / parameters.contact.distance**3 * areas(surface, rest)[0]
+        strength = parameters.stiffness / parameters.distance**3 * areas(surface, rest)[0]
         count = len(strength)
         repeated = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), parameters.shape)
-        return repeated, strength, jnp.broadcast_to(parameters.contact.distance**2, (count,))
+        return repeated, strength, jnp.broadcast_to(parameters.distance**2, (count,))
 
     def energy(x: Float[Array, "1 dim"], data: tuple[Any, Array, Array]) -> Float[Array, ""]:
         shape, strength, near = data
-        d = obstacle.distance(x[0], shape)
+        d = shape.distance(x[0])
         # Inside the obstacle the energy is infinite, so that no step is accepted there.
         return jnp.where(d > 0, strength * barrier(d**2, near)[0], jnp.inf)
 
-    def longest(x: Array, step: Array, elements: Elements, data: tuple[ObstacleParameters, Array]) -> Array:
+    def longest(x: Array, step: Array, elements: Elements, data: tuple[ContactParameters, Array]) -> Array:
         def at(t: Array) -> Array:
             moved = x[surface.vertices] + t[:, None] * step[surface.vertices]
-            return distances(moved, data[0].shape)
+            return distances(data[0].shape, moved)
 
         return longest_step(at, jnp.linalg.norm(step[surface.vertices], axis=1))
 
-    def slide(x: Float[Array, "1 dim"], slip: Slip) -> Float[Array, ""]:
-        return friction_energy(x[0], slip)
+    def hessian(x: Array, data: Any) -> Array:
+        return jax.hessian(energy)(x, data).reshape(x.size, x.size)
 
-    def energies_of(function: Callable[..., Array], describe: Callable[..., Any], longest: Any) -> MovingEnergy:
-        def hessian(x: Array, data: Any) -> Array:
-            return jax.hessian(function)(x, data).reshape(x.size, x.size)
-
-        return MovingEnergy(lambda *_: every, describe, jax.value_and_grad(function), hessian, longest)
-
-    def prepare(parameters: ObstacleParameters, context: Context) -> tuple[Any, ...]:
+    def prepare(parameters: ContactParameters, context: Context) -> tuple[Any, ...]:
         data = (parameters, context.rest)
-        if parameters.contact.friction is None:
+        if parameters.friction is None:
             return (data,)
         x, lagged = (at[surface.vertices] for at in (context.x, context.x if context.lag is None else context.lag))
-        d, slope = jax.vmap(jax.value_and_grad(obstacle.distance), (0, None))(lagged, parameters.shape)
+        d, slope = jax.vmap(jax.value_and_grad(parameters.shape.distance))(lagged)
         steep = jnp.linalg.norm(slope, axis=1)
         _, strength, near = describe(context.x, every, data)
         force = -2 * d * strength * barrier(d**2, near)[1] * steep
         carried = x + motion_of(name, parameters, context.before, x)
-        largest = parameters.contact.friction * force
-        return data, slip_of(context, threshold_speed, carried, slope / steep[:, None], largest)
+        largest = parameters.friction * force
+        slip = slip_of(context, threshold_speed, carried, slope / steep[:, None], largest)
+        return data, (every, (slip, jnp.ones((len(x), 1), x.dtype)))
 
-    energies = [energies_of(energy, describe, longest)]
-    if friction is not None:
-        energies.append(energies_of(slide, lambda x, _, slip: slip, lambda x, *_: jnp.ones((), x.dtype)))
+    pushing = MovingEnergy(lambda *_: every, describe, jax.value_and_grad(energy), hessian, longest)
 
-    def least_distance(x: Array, elements: Elements, data: tuple[ObstacleParameters, Array]) -> Array:
-        return jnp.minimum(jnp.min(distances(x[surface.vertices], data[0].shape)), data[0].contact.distance)
+    def least_distance(x: Array, elements: Elements, data: tuple[ContactParameters, Array]) -> Array:
+        return jnp.minimum(jnp.min(distances(data[0].shape, x[surface.vertices])), data[0].distance)
 
-    return Contact(name, parameters, tuple(energies), prepare, least_distance, mesh, changing=False)
+    energies = (pushing,) if friction is None else (pushing, SLIDING)
+    return Contact(name, parameters, energies, prepare, least_distance, mesh, changing=False)
 
 
 def _spline(values: Float[Array, "*outer k"], at: Float[Array, ""]) -> Float[Array, "*outer"]:

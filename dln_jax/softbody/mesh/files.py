@@ -20,7 +20,7 @@ from dln_jax.files import is_file, write_bytes, writing
 from dln_jax.softbody.mesh.gmsh import read_gmsh
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.simplices import simplex_volumes
-from dln_jax.softbody.mesh.solids import ELEMENTS, MERGE, FileMesh, ReadMesh, solid_mesh
+from dln_jax.softbody.mesh.solids import ELEMENTS, MERGE, FileMesh, ReadMesh, corners_by_kind, solid_mesh
 from dln_jax.types import InputError, require_positive
 
 SUFFIXES = (".msh", ".vtk", ".vtu", ".obj", ".ele", ".node")
@@ -162,11 +162,11 @@ def _read_by_meshio(path: Path) -> FileMesh:
             content = meshio.read(path)
         points = np.asarray(content.points, np.float64)
         points = np.pad(points[:, :3], ((0, 0), (0, max(3 - points.shape[1], 0))))
-        blocks = [(block.type, np.asarray(block.data, np.int64)) for block in content.cells]
+        blocks = [(block.type.rstrip("0123456789"), np.asarray(block.data, np.int64)) for block in content.cells]
     except (Exception, SystemExit) as error:
         reason = printed.getvalue().strip() or f"{type(error).__name__}: {error}"
         raise InputError(f"meshio cannot read it ({' '.join(reason.split())[:200]}); save it again") from None
-    cells = {kind: np.concatenate([nodes for name, nodes in blocks if name == kind]) for kind, _ in blocks}
+    cells, curved = corners_by_kind(blocks)
     vertex_sets = {
         name: np.flatnonzero(members)
         for key, values in content.point_data.items()
@@ -179,7 +179,7 @@ def _read_by_meshio(path: Path) -> FileMesh:
             continue
         for name, members in _sets(key, np.concatenate([np.asarray(part) for part in parts])):
             cell_sets[name] = {kind: np.flatnonzero(members[kinds == kind]) for kind in cells}
-    return FileMesh(points, cells, vertex_sets, cell_sets)
+    return FileMesh(points, cells, vertex_sets, cell_sets, curved)
 
 
 def _sets(key: str, values: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:

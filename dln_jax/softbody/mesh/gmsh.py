@@ -7,35 +7,53 @@ several; this reader accepts all of them.
 
 import re
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from dln_jax.softbody.mesh.solids import DIMENSIONS, FileMesh, base
+from dln_jax.softbody.mesh.solids import CELLS, FileMesh, corners_by_kind
 from dln_jax.types import InputError
 
 Take = Callable[[str, Any], np.ndarray]
 """(type, count) -> the next numbers of a section."""
+_Block = tuple[str, np.ndarray, tuple[str, ...]]
+"""Kind and nodes of cells that are in the same physical groups, and these groups."""
 
 KINDS = {
-    **{1: ("line", 2), 2: ("triangle", 3), 3: ("quad", 4), 4: ("tetra", 4), 5: ("hexahedron", 8), 6: ("wedge", 6)},
-    **{7: ("pyramid", 5), 8: ("line3", 3), 9: ("triangle6", 6), 10: ("quad9", 9), 11: ("tetra10", 10)},
-    **{12: ("hexahedron27", 27), 13: ("wedge18", 18), 14: ("pyramid14", 14), 15: ("vertex", 1), 16: ("quad8", 8)},
-    **{17: ("hexahedron20", 20), 18: ("wedge15", 15), 19: ("pyramid13", 13), 21: ("triangle10", 10)},
-    **{23: ("triangle15", 15), 25: ("triangle21", 21), 26: ("line4", 4), 27: ("line5", 5), 28: ("line6", 6)},
-    **{29: ("tetra20", 20), 30: ("tetra35", 35), 31: ("tetra56", 56), 36: ("quad16", 16), 37: ("quad25", 25)},
+    1: "line2",
+    2: "triangle3",
+    3: "quad4",
+    4: "tetra4",
+    5: "hexahedron8",
+    6: "wedge6",
+    7: "pyramid5",
+    8: "line3",
+    9: "triangle6",
+    10: "quad9",
+    11: "tetra10",
+    12: "hexahedron27",
+    13: "wedge18",
+    14: "pyramid14",
+    15: "vertex1",
+    16: "quad8",
+    17: "hexahedron20",
+    18: "wedge15",
+    19: "pyramid13",
+    21: "triangle10",
+    23: "triangle15",
+    25: "triangle21",
+    26: "line4",
+    27: "line5",
+    28: "line6",
+    29: "tetra20",
+    30: "tetra35",
+    31: "tetra56",
+    36: "quad16",
+    37: "quad25",
 }
-"""Kind of cell and number of nodes by Gmsh's number; corners come first in all of them."""
+"""Kind of cell by Gmsh's number, and number of its nodes at the end."""
 GEOMETRY = ("point", "curve", "surface", "volume")
 """Physical groups without a name get these names and their number, such as surface-3."""
-
-
-class _Block(NamedTuple):
-    """Cells of one kind that are in the same physical groups."""
-
-    kind: str
-    nodes: np.ndarray
-    groups: tuple[str, ...]
 
 
 def read_gmsh(data: bytes) -> FileMesh:
@@ -57,22 +75,24 @@ def read_gmsh(data: bytes) -> FileMesh:
     binary = form[1] == b"1"
     if binary and form[2] not in (b"4", b"8"):
         raise InputError(f"its numbers have {form[2].decode(errors='replace'):.10} bytes; expected 4 or 8")
-    order = ">" if binary and form[3][:4] == b"\0\0\0\1" else "<"
-    types = {"i": f"{order}i4", "d": f"{order}f8", "n": f"{order}u{int(form[2])}"}
+    types = None
+    if binary:
+        order = ">" if form[3][:4] == b"\0\0\0\1" else "<"
+        types = {"i": f"{order}i4", "d": f"{order}f8", "n": f"{order}u{int(form[2])}"}
     names = {
         (int(dimension), int(tag)): name.decode(errors="replace")
         for dimension, tag, name in re.findall(rb'(\d+)\s+(\d+)\s+"(.*)"', sections.get("PhysicalNames", b""))
     }
 
     def reader(name: str) -> Take:
-        return _binary(sections[name], types) if binary else _ascii(sections[name])
+        return _reader(sections[name], types)
 
     if version == "4.1":
         tags, points = _nodes(reader("Nodes"))
         blocks = list(_elements(reader("Elements"), _groups(reader, sections, names)))
     else:
-        tags, points = _nodes_2(sections["Nodes"], binary, order)
-        blocks = list(_elements_2(sections["Elements"], binary, types, names))
+        tags, points = _nodes_2(sections["Nodes"], types)
+        blocks = list(_elements_2(sections["Elements"], types, names))
     return _gathered(tags, points, blocks, list(names.values()))
 
 
@@ -82,23 +102,22 @@ def _gathered(tags: np.ndarray, points: np.ndarray, blocks: list[_Block], names:
     A named group without elements becomes an empty set: MSH 2.2 with `Mesh.SaveAll` keeps only the names.
     """
     order = np.argsort(tags, kind="stable")
-    cells: dict[str, np.ndarray] = {}
+    cells, curved = corners_by_kind([(kind, nodes) for kind, nodes, _ in blocks])
     sets: dict[str, dict[str, list[np.ndarray]]] = {name: {} for name in names}
-    for kind in dict.fromkeys(block.kind for block in blocks):
-        own = [block for block in blocks if block.kind == kind]
-        nodes = np.concatenate([block.nodes for block in own]).astype(np.int64)
+    starts = dict.fromkeys(cells, 0)
+    for kind, nodes, groups in blocks:
+        for name in groups:
+            sets.setdefault(name, {}).setdefault(kind, []).append(starts[kind] + np.arange(len(nodes)))
+        starts[kind] += len(nodes)
+    for kind, nodes in cells.items():
         place = np.searchsorted(tags[order], nodes).clip(max=len(tags) - 1)
         if len(unknown := np.argwhere(tags[order][place] != nodes)):
             raise InputError(
                 f"{kind} {unknown[0][0]} has node {nodes[tuple(unknown[0])]}, which the file does not list"
             )
-        cells[kind], start = order[place], 0
-        for block in own:
-            for name in block.groups:
-                sets.setdefault(name, {}).setdefault(kind, []).append(start + np.arange(len(block.nodes)))
-            start += len(block.nodes)
+        cells[kind] = order[place]
     joined = {name: {kind: np.concatenate(parts) for kind, parts in kinds.items()} for name, kinds in sets.items()}
-    return FileMesh(points, cells, {}, joined)
+    return FileMesh(points, cells, {}, joined, curved)
 
 
 def _sections(data: bytes) -> Iterator[tuple[str, bytes]]:
@@ -114,28 +133,21 @@ def _sections(data: bytes) -> Iterator[tuple[str, bytes]]:
         at = end + len(name) + 4
 
 
-def _ascii(section: bytes) -> Take:
-    numbers, at = np.fromiter(map(float, section.split()), np.float64), 0
-
-    def take(kind: str, count: Any) -> np.ndarray:
-        nonlocal at
-        part, at = numbers[at : at + int(count)], at + int(count)
-        if len(part) != count:
-            raise ValueError("a section has fewer numbers than its header states")
-        return part if kind == "d" else part.astype(np.int64)
-
-    return take
-
-
-def _binary(section: bytes, types: dict[str, str]) -> Take:
+def _reader(section: bytes, types: dict[str, str] | None) -> Take:
+    """Returns a function that reads one number after another: of these types in NumPy's words, or as text."""
+    numbers = np.fromiter(map(float, section.split() if types is None else ()), np.float64)
     at = 0
 
     def take(kind: str, count: Any) -> np.ndarray:
         nonlocal at
-        part = np.frombuffer(section, types[kind], int(count), at) if count else np.zeros(0)
+        if types is None:
+            part = numbers[at : at + int(count)]
+            at += len(part)
+        else:
+            part = np.frombuffer(section, types[kind], int(count), at) if count else np.zeros(0)
+            at += part.nbytes
         if len(part) != count:  # a negative count takes all
             raise ValueError("a section has fewer numbers than its header states")
-        at += part.nbytes
         return part.astype(np.float64 if kind == "d" else np.int64)
 
     return take
@@ -178,25 +190,23 @@ def _elements(take: Take, groups: dict[tuple[int, int], tuple[str, ...]]) -> Ite
         kind, nodes = _kind(number)
         count = take("n", 1)[0]
         rows = take("n", count * (1 + nodes)).reshape(count, 1 + nodes)
-        yield _Block(kind, rows[:, 1:], groups.get((int(dimension), int(tag)), ()))
+        yield kind, rows[:, 1:], groups.get((int(dimension), int(tag)), ())
 
 
-def _nodes_2(section: bytes, binary: bool, order: str) -> tuple[np.ndarray, np.ndarray]:
+def _nodes_2(section: bytes, types: dict[str, str] | None) -> tuple[np.ndarray, np.ndarray]:
     """Returns tags and positions of the nodes, version 2.2."""
     count, _, content = section.partition(b"\n")
-    if binary:
-        rows = np.frombuffer(content, [("tag", f"{order}i4"), ("x", f"{order}f8", 3)], int(count))
+    if types is not None:
+        rows = np.frombuffer(content, [("tag", types["i"]), ("x", types["d"], 3)], int(count))
         return rows["tag"].astype(np.int64), rows["x"].astype(np.float64)
-    table = _ascii(content)("d", 4 * int(count)).reshape(-1, 4)
+    table = _reader(content, None)("d", 4 * int(count)).reshape(-1, 4)
     return table[:, 0].astype(np.int64), table[:, 1:]
 
 
-def _elements_2(
-    section: bytes, binary: bool, types: dict[str, str], names: dict[tuple[int, int], str]
-) -> Iterator[_Block]:
+def _elements_2(section: bytes, types: dict[str, str] | None, names: dict[tuple[int, int], str]) -> Iterator[_Block]:
     """Yields elements of version 2.2: the first tag of an element is its group, and every group lists it once."""
     count, _, content = section.partition(b"\n")
-    take = _binary(content, types) if binary else _ascii(content)
+    take, binary = _reader(content, types), types is not None
     tables: dict[tuple[int, int], list[np.ndarray]] = {}
     read = 0
     while read < int(count):
@@ -211,14 +221,16 @@ def _elements_2(
         table, kind = np.concatenate(parts)[:, int(binary) :], _kind(number)[0]
         groups = table[:, 0] if tags else np.zeros(len(table), np.int64)
         for group in np.unique(groups).tolist():
-            name = (_name(names, DIMENSIONS[base(kind)], group),) if group else ()
-            yield _Block(kind, table[groups == group][:, tags:], name)
+            name = (_name(names, CELLS[kind][0], group),) if group else ()
+            yield kind, table[groups == group][:, tags:], name
 
 
 def _kind(number: Any) -> tuple[str, int]:
+    """Returns the linear kind of the cells with this number of Gmsh, and the number of their nodes."""
     if (kind := KINDS.get(int(number))) is None:
         raise InputError(f"it has elements of Gmsh's type {number}; expected linear triangles or tetrahedra")
-    return kind
+    linear = kind.rstrip("0123456789")
+    return linear, int(kind.removeprefix(linear))
 
 
 def _name(names: dict[tuple[int, int], str], dimension: int, tag: int) -> str:

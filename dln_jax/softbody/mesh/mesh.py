@@ -5,17 +5,15 @@ Meshes are static NumPy arrays in float64, which become constants of the compile
 """
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from dln_jax.softbody.mesh.simplices import facets, regularity, simplex_volumes
+from dln_jax.softbody.mesh.simplices import connected, facets, regularity, simplex_volumes
 from dln_jax.types import InputError
 
 FLAT = 1e-12
@@ -70,12 +68,24 @@ def make_mesh(vertices: ArrayLike, elements: ArrayLike) -> Mesh:
             repeated, a duplicate or degenerate element, a vertex in no element. Also if elements share no vertices
             although some of their corners coincide: the vertices of such a mesh were never merged.
     """
-    positions = _as_vertices(vertices)
-    corners = _as_elements(elements, positions.shape[1])
-    _require_indices(positions, corners)
-    shape = regularity(positions, corners)
-    _require_volumes(positions, corners, shape)
-    inverted = shape < 0
+    positions = _as_array("vertices", vertices)
+    if positions.dtype.kind not in "iuf":
+        raise InputError(f"vertices has type {positions.dtype}; expected real numbers: positions in m")
+    if positions.ndim != 2 or positions.shape[1] not in (2, 3):
+        raise InputError(f"vertices has shape {list(positions.shape)}; expected [n, 2] (plane) or [n, 3] (space)")
+    positions = positions.astype(np.float64)
+    if (bad := np.flatnonzero(~np.isfinite(positions).all(axis=1))).size:
+        raise InputError(f"vertex {bad[0]} is at {positions[bad[0]].tolist()}; expected finite numbers{_others(bad)}")
+    corners, dim = _as_array("elements", elements), positions.shape[1]
+    if corners.ndim != 2 or corners.shape[1] != dim + 1 or not corners.shape[0]:
+        raise InputError(
+            f"elements has shape {list(corners.shape)}; expected [m, {dim + 1}] with m >= 1, "
+            f"the corners of each {WORDS[dim][0]}, as vertices has {dim} columns"
+        )
+    if corners.dtype.kind not in "iu":
+        raise InputError(f"elements has type {corners.dtype}; expected integers: the indices of vertices")
+    corners = corners.astype(np.int64)
+    inverted = _require_elements(positions, corners) < 0
     turned = np.where(inverted[:, None], corners[:, [*range(corners.shape[1] - 2), -1, -2]], corners)
     return Mesh(positions, turned.astype(np.int32), int(inverted.sum()))
 
@@ -83,12 +93,6 @@ def make_mesh(vertices: ArrayLike, elements: ArrayLike) -> Mesh:
 def volumes(mesh: Mesh) -> Float[np.ndarray, " m"]:
     """Returns areas in m² or volumes in m³ of the elements."""
     return simplex_volumes(mesh.vertices, mesh.nodes)
-
-
-def edges(mesh: Mesh) -> Int[np.ndarray, "e 2"]:
-    """Returns the distinct edges in lexicographic order, each with the smaller vertex first."""
-    pairs = list(itertools.combinations(range(mesh.dimension + 1), 2))
-    return np.unique(np.sort(mesh.elements[:, pairs].reshape(-1, 2), axis=1), axis=0)
 
 
 def boundary(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
@@ -132,11 +136,7 @@ def indices_of(name: str, values: Any, count: int, what: str = "vertex") -> Int[
 
 def components(mesh: Mesh) -> Int[np.ndarray, " m"]:
     """Returns the component of every element, counted from 0; shared vertices connect elements."""
-    n, m = len(mesh.vertices), len(mesh.elements)
-    corners = mesh.elements.ravel()
-    first = np.repeat(mesh.elements[:, 0], mesh.elements.shape[1])
-    _, of_vertices = connected_components(coo_array((np.ones(len(corners)), (first, corners)), shape=(n, n)))
-    return np.unique(of_vertices[mesh.elements[:, 0]], return_inverse=True)[1].reshape(m)
+    return connected(mesh.elements)
 
 
 def components_of_vertices(mesh: Mesh) -> Int[np.ndarray, " n"]:
@@ -162,6 +162,45 @@ def vertices_where(mesh: Mesh, condition: Callable[[Float[np.ndarray, "n dim"]],
         low, high = mesh.vertices.min(axis=0).tolist(), mesh.vertices.max(axis=0).tolist()
         raise InputError(f"no vertex satisfies the condition; the mesh extends from {low} to {high} m")
     return np.flatnonzero(chosen)
+
+
+def vertices_in(mesh: Mesh, names: Iterable[str]) -> Int[np.ndarray, " k"]:
+    """Returns the vertices that are in any of these sets, in ascending order, for example for `held`.
+
+    Raises:
+        InputError: a set does not exist (the message lists those that do), or has no vertices.
+    """
+    members = [np.zeros(0, np.int64)]
+    for name in names:
+        if not len(vertices := _named(mesh, name).vertices):
+            raise InputError(
+                f"no vertex of the body is in the set '{name}' (MSH 2.2 with SaveAll keeps only names; use 4.1)"
+            )
+        members.append(vertices)
+    return np.unique(np.concatenate(members))
+
+
+def values_by_set(mesh: Mesh, default: float, values: Mapping[str, float]) -> Float[np.ndarray, " m"]:
+    """Returns one value per element, such as Young's modulus: that of its set, or the default outside these sets.
+
+    An element in several of these sets gets the value of the last one.
+
+    Raises:
+        InputError: a set does not exist, or has no elements.
+    """
+    result = np.full(len(mesh.elements), float(default))
+    for name, value in values.items():
+        if not len(elements := _named(mesh, name).elements):
+            raise InputError(f"the set '{name}' has no elements; expected a set of {WORDS[mesh.dimension][0]} elements")
+        result[elements] = value
+    return result
+
+
+def _named(mesh: Mesh, name: str) -> NamedSet:
+    if name not in mesh.sets:
+        known = f"the sets are {', '.join(sorted(mesh.sets))}" if mesh.sets else "it has no named sets"
+        raise InputError(f"the mesh has no set '{name}'; {known}")
+    return mesh.sets[name]
 
 
 def lumped_masses(mesh: Mesh, density: int | float | ArrayLike) -> Float[np.ndarray, " n"]:
@@ -206,54 +245,8 @@ def _facet_sides(mesh: Mesh) -> tuple[Int[np.ndarray, "f dim"], Int[np.ndarray, 
     return every[first[order]], counts[order]
 
 
-def _as_vertices(vertices: ArrayLike) -> Float[np.ndarray, "n dim"]:
-    array = _as_array("vertices", vertices)
-    if array.dtype.kind not in "iuf":
-        raise InputError(f"vertices has type {array.dtype}; expected real numbers: positions in m")
-    if array.ndim != 2 or array.shape[1] not in (2, 3):
-        raise InputError(f"vertices has shape {list(array.shape)}; expected [n, 2] (plane) or [n, 3] (space)")
-    array = array.astype(np.float64)
-    if (bad := np.flatnonzero(~np.isfinite(array).all(axis=1))).size:
-        raise InputError(f"vertex {bad[0]} is at {array[bad[0]].tolist()}; expected finite numbers{_others(bad)}")
-    return array
-
-
-def _as_elements(elements: ArrayLike, dim: int) -> Int[np.ndarray, "m corners"]:
-    array = _as_array("elements", elements)
-    kind = WORDS[dim][0]
-    if array.ndim != 2 or array.shape[1] != dim + 1 or not array.shape[0]:
-        raise InputError(
-            f"elements has shape {list(array.shape)}; expected [m, {dim + 1}] with m >= 1, "
-            f"the corners of each {kind}, as vertices has {dim} columns"
-        )
-    if array.dtype.kind not in "iu":
-        raise InputError(f"elements has type {array.dtype}; expected integers: the indices of vertices")
-    return array.astype(np.int64)
-
-
-def _require_volumes(vertices: np.ndarray, elements: np.ndarray, shape: np.ndarray) -> None:
-    """Refuses flat elements, which have no strain, and vertices without mass or without a second element."""
-    kind, measure = WORDS[vertices.shape[1]]
-    if (bad := np.flatnonzero(np.abs(shape) <= FLAT)).size:
-        raise InputError(
-            f"element {bad[0]} is degenerate: the {measure} of {kind} {elements[bad[0]].tolist()} is "
-            f"{shape[bad[0]]:.1e} of a regular one's; expected more than {FLAT:.0e}; "
-            f"leave it out, merge its corners or move one{_others(bad)}"
-        )
-    uses = np.bincount(elements.ravel(), minlength=len(vertices))
-    if (bad := np.flatnonzero(uses == 0)).size:
-        raise InputError(
-            f"vertex {bad[0]} is dangling: it belongs to no element and would have no mass; remove it{_others(bad)}"
-        )
-    if uses.max() == 1 and (distinct := len(np.unique(vertices, axis=0))) < len(vertices):
-        raise InputError(
-            f"no two of the {len(elements)} elements share a vertex, so that each would move alone; "
-            f"the {len(vertices)} vertices have {distinct} distinct positions: merge those at the same position"
-        )
-
-
-def _require_indices(vertices: np.ndarray, elements: np.ndarray) -> None:
-    """Refuses corners out of range or repeated, and elements that would count twice."""
+def _require_elements(vertices: np.ndarray, elements: np.ndarray) -> Float[np.ndarray, " m"]:
+    """Returns the elements' `regularity`; refuses elements that are wrong, and vertices without a second element."""
     n = len(vertices)
     if (bad := np.flatnonzero(((elements < 0) | (elements >= n)).any(axis=1))).size:
         corners = elements[bad[0]]
@@ -274,6 +267,25 @@ def _require_indices(vertices: np.ndarray, elements: np.ndarray) -> None:
     original = first[inverse.reshape(-1)]
     if (bad := np.flatnonzero(original != np.arange(len(elements)))).size:
         raise InputError(f"element {bad[0]} is a duplicate of element {original[bad[0]]}; remove one{_others(bad)}")
+    shape = regularity(vertices, elements)
+    kind, measure = WORDS[vertices.shape[1]]
+    if (bad := np.flatnonzero(np.abs(shape) <= FLAT)).size:
+        raise InputError(
+            f"element {bad[0]} is degenerate: the {measure} of {kind} {elements[bad[0]].tolist()} is "
+            f"{shape[bad[0]]:.1e} of a regular one's; expected more than {FLAT:.0e}; "
+            f"leave it out, merge its corners or move one{_others(bad)}"
+        )
+    uses = np.bincount(elements.ravel(), minlength=n)
+    if (bad := np.flatnonzero(uses == 0)).size:
+        raise InputError(
+            f"vertex {bad[0]} is dangling: it belongs to no element and would have no mass; remove it{_others(bad)}"
+        )
+    if uses.max() == 1 and (distinct := len(np.unique(vertices, axis=0))) < n:
+        raise InputError(
+            f"no two of the {len(elements)} elements share a vertex, so that each would move alone; "
+            f"the {n} vertices have {distinct} distinct positions: merge those at the same position"
+        )
+    return shape
 
 
 def _as_array(name: str, value: ArrayLike) -> np.ndarray:

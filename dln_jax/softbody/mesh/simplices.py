@@ -11,6 +11,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 AnyArray = TypeVar("AnyArray", np.ndarray, Array)
 
@@ -55,8 +57,14 @@ def reference_gradients(dimension: int) -> Float[np.ndarray, "points nodes dim"]
     """Returns derivatives of a quadratic element's shape functions by the barycentric coordinates l1, ..., ldim."""
     fraction, count = _FRACTION[dimension], dimension + 1
     points = np.full((count, count), fraction) + (1 - count * fraction) * np.eye(count)
+    return _slopes(points, SIDES[dimension])
+
+
+def _slopes(points: Float[np.ndarray, "points corners"], sides: Any) -> Float[np.ndarray, "points nodes dim"]:
+    """Returns derivatives of quadratic shape functions at points with these barycentric coordinates."""
+    dimension = points.shape[1] - 1
     slopes = np.concatenate([-np.ones((1, dimension)), np.eye(dimension)])
-    i, j = np.array(SIDES[dimension]).T
+    i, j = np.array(sides).T
     corners = (4 * points - 1)[:, :, None] * slopes
     return np.concatenate([corners, 4 * (points[:, i, None] * slopes[j] + points[:, j, None] * slopes[i])], axis=1)
 
@@ -69,8 +77,8 @@ def facet_rule(
     Nodes are the corners, then the mid-side nodes in the order of `SIDES`. The rules (centroid; Gauss with 2 points;
     Strang and Fix 1973 with 6 points) are exact for the volume that the facets enclose.
     """
-    slopes = np.concatenate([-np.ones((1, dimension - 1)), np.eye(dimension - 1)])
     if not quadratic:
+        slopes = np.concatenate([-np.ones((1, dimension - 1)), np.eye(dimension - 1)])
         return np.full((1, dimension), 1 / dimension), slopes[None], np.array([1.0 / math.factorial(dimension - 1)])
     if dimension == 2:
         first, weights, sides = (1 + np.array([-1.0, 1.0]) / math.sqrt(3)) / 2, np.full(2, 0.5), [(0, 1)]
@@ -83,8 +91,7 @@ def facet_rule(
         points = np.where(np.tile(np.eye(3, dtype=bool), (2, 1)), 1 - 2 * fractions[:, None], fractions[:, None])
     i, j = np.array(sides).T
     values = np.concatenate([points * (2 * points - 1), 4 * points[:, i] * points[:, j]], axis=1)
-    between = 4 * (points[:, i, None] * slopes[j] + points[:, j, None] * slopes[i])
-    return values, np.concatenate([(4 * points - 1)[:, :, None] * slopes, between], axis=1), weights
+    return values, _slopes(points, sides), weights
 
 
 def determinant(F: Any) -> Any:
@@ -127,3 +134,11 @@ def regularity(vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray, "
 def facets(elements: Int[np.ndarray, "m corners"]) -> Int[np.ndarray, "m corners dim"]:
     """Returns the facets of all elements, oriented outwards unless the element is inverted."""
     return elements[:, np.array(FACETS[elements.shape[1] - 1])]
+
+
+def connected(rows: Int[np.ndarray, "m k"]) -> Int[np.ndarray, " m"]:
+    """Returns the component of every row, counted from 0; common numbers connect rows."""
+    size = int(rows.max()) + 1
+    pairs = np.repeat(rows[:, 0], rows.shape[1]), rows.ravel()
+    _, label = connected_components(coo_array((np.ones(rows.size), pairs), shape=(size, size)))
+    return np.unique(label[rows[:, 0]], return_inverse=True)[1].reshape(-1)

@@ -4,6 +4,8 @@ Every change is reported. A set of surfaces, curves or points becomes a set of v
 elements becomes a set of elements and of their corners.
 """
 
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -19,19 +21,18 @@ from dln_jax.types import InputError, require_positive
 
 MERGE = 1e-7
 """Vertices closer than this fraction of the largest extent are merged; single precision rounds to 6e-8."""
-CORNERS = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4, "tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
-"""Number of corners of the cells that a file may contain; corners come first in all formats."""
-DIMENSIONS = {
-    "vertex": 0,
-    "line": 1,
-    "triangle": 2,
-    "quad": 2,
-    "polygon": 2,
-    "tetra": 3,
-    "hexahedron": 3,
-    "wedge": 3,
-    "pyramid": 3,
+CELLS = {
+    "vertex": (0, 1),
+    "line": (1, 2),
+    "triangle": (2, 3),
+    "quad": (2, 4),
+    "polygon": (2, None),
+    "tetra": (3, 4),
+    "pyramid": (3, 5),
+    "wedge": (3, 6),
+    "hexahedron": (3, 8),
 }
+"""Dimension and number of corners of the cells that a file may contain; corners come first in all formats."""
 ELEMENTS = {2: "triangle", 3: "tetra"}
 
 
@@ -40,10 +41,12 @@ class FileMesh(NamedTuple):
 
     points: Float[np.ndarray, "n 3"]
     cells: dict[str, Int[np.ndarray, "m k"]]
-    """Nodes of the cells by kind, in meshio's names: triangle, tetra10, ..."""
+    """Corners of the cells by kind, in meshio's names of linear ones: triangle, tetra, ..."""
     vertex_sets: dict[str, Int[np.ndarray, " k"]]
     cell_sets: dict[str, dict[str, Int[np.ndarray, " k"]]]
     """Indices of cells by name of the set and kind of cell."""
+    curved: Mapping[str, int] = MappingProxyType({})
+    """Number of cells of higher order, which have been reduced to their corners, by kind."""
 
 
 class ReadMesh(NamedTuple):
@@ -70,12 +73,13 @@ def solid_mesh(content: FileMesh, *, scale: float = 1.0, merge: float = MERGE) -
     """
     require_positive(scale=scale)
     of_dimension = {
-        d: {kind: nodes for kind, nodes in content.cells.items() if DIMENSIONS.get(base(kind), 3) == d and len(nodes)}
+        d: {kind: nodes for kind, nodes in content.cells.items() if CELLS.get(kind, (3,))[0] == d and len(nodes)}
         for d in (2, 3)
     }
     if not any(of_dimension.values()):
         raise InputError("it has no triangles or tetrahedra; mesh the body, and save its elements")
     dimension = 3 if of_dimension[3] else 2
+    element = ELEMENTS[dimension]
     points = scale * content.points
     if len(bad := np.flatnonzero(~(np.abs(points) <= LARGEST).all(axis=1))):
         raise InputError(f"vertex {bad[0]} is at {points[bad[0]].tolist()} m; expected finite positions")
@@ -86,49 +90,37 @@ def solid_mesh(content: FileMesh, *, scale: float = 1.0, merge: float = MERGE) -
     if dimension == 2:
         points = _in_plane(points, np.concatenate([nodes.ravel() for nodes in of_dimension[2].values()]))
     for kind, nodes in of_dimension[dimension].items():
-        if base(kind) != ELEMENTS[dimension]:
-            simplices = _plural(ELEMENTS[dimension])
-            raise InputError(f"it has {len(nodes)} {_plural(base(kind))}; mesh the body with {simplices} only")
-    cells, cell_sets, statements = _corners(content, ELEMENTS[dimension])
-    elements = cells.pop(ELEMENTS[dimension])
-    if others := [f"{len(nodes)} {_plural(kind)}" for kind, nodes in cells.items() if len(nodes)]:
-        kept = f"{len(elements)} {_plural(ELEMENTS[dimension])}"
+        if kind != element:
+            raise InputError(f"it has {len(nodes)} {_plural(kind)}; mesh the body with {_plural(element)} only")
+    elements, statements = content.cells[element], []
+    if count := content.curved.get(element):
+        statements.append(
+            f"{count} elements of higher order are reduced to their corners, which makes their edges straight"
+        )
+    if others := [f"{len(of)} {_plural(kind)}" for kind, of in content.cells.items() if kind != element and len(of)]:
+        kept = f"{len(elements)} {_plural(element)}"
         statements.append(f"the body is its {kept}; {', '.join(others)} are left out, and name vertices only")
     sets = {name: (vertices, np.zeros(0, np.int64)) for name, vertices in content.vertex_sets.items()}
-    for name, members in cell_sets.items():
-        own = members.pop(ELEMENTS[dimension], np.zeros(0, np.int64))
-        corners = [elements[own].ravel(), *(cells[kind][indices].ravel() for kind, indices in members.items())]
-        sets[name] = np.concatenate([*(sets[name][:1] if name in sets else ()), *corners]), own
+    for name, members in content.cell_sets.items():
+        corners = [content.cells[kind][indices].ravel() for kind, indices in members.items()]
+        vertices = np.concatenate([*(sets[name][:1] if name in sets else ()), *corners, np.zeros(0, np.int64)])
+        sets[name] = vertices, members.get(element, np.zeros(0, np.int64))
     return _repaired(points, elements, sets, merge, statements)
 
 
-def base(kind: str) -> str:
-    """Returns the first-order kind of a cell: triangle for triangle6."""
-    return kind.rstrip("0123456789")
+def corners_by_kind(blocks: Sequence[tuple[str, np.ndarray]]) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Returns corners of the cells by kind, and how many have more nodes, from a file's blocks (linear kind, nodes)."""
+    cells, curved = {}, {}
+    for kind in dict.fromkeys(kind for kind, _ in blocks):
+        count = CELLS.get(kind, (3, None))[1]
+        own = [nodes for name, nodes in blocks if name == kind]
+        cells[kind] = np.concatenate([nodes[:, :count] for nodes in own])
+        curved[kind] = sum(len(nodes) for nodes in own if count and nodes.shape[1] > count)
+    return cells, curved
 
 
 def _plural(kind: str) -> str:
     return {"vertex": "points", "tetra": "tetrahedra", "hexahedron": "hexahedra"}.get(kind, f"{kind}s")
-
-
-def _corners(
-    content: FileMesh, element: str
-) -> tuple[dict[str, np.ndarray], dict[str, dict[str, np.ndarray]], list[str]]:
-    """Returns corners of the cells by first-order kind, the sets of these cells, and a statement on curved elements."""
-    cells: dict[str, np.ndarray] = {}
-    sets: dict[str, dict[str, np.ndarray]] = {name: {} for name in content.cell_sets}
-    curved = 0
-    for kind, nodes in content.cells.items():
-        first, corners = base(kind), nodes[:, : CORNERS.get(base(kind))]
-        start = len(cells.get(first, ()))
-        cells[first] = np.concatenate([cells[first], corners]) if start else corners
-        curved += len(nodes) * (kind != first == element)
-        for name, members in content.cell_sets.items():
-            if kind in members:
-                before = sets[name].get(first, np.zeros(0, np.int64))
-                sets[name][first] = np.concatenate([before, start + members[kind]])
-    text = f"{curved} elements of higher order are reduced to their corners, which makes their edges straight"
-    return cells, sets, [text] * bool(curved)
 
 
 def _in_plane(points: Float[np.ndarray, "n 3"], corners: Int[np.ndarray, " k"]) -> Float[np.ndarray, "n 2"]:

@@ -15,12 +15,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from dln_jax.softbody.mesh.mesh import Mesh, boundary
-from dln_jax.softbody.mesh.sets import vertices_in
-from dln_jax.softbody.mesh.simplices import SIDES, AnyArray, determinant, facet_rule
+from dln_jax.softbody.mesh.mesh import Mesh, boundary, vertices_in
+from dln_jax.softbody.mesh.simplices import SIDES, AnyArray, connected, determinant, facet_rule
 from dln_jax.types import InputError
 
 RIDGES = {2: "vertex", 3: "edge"}
@@ -34,11 +31,8 @@ def surface_parts(mesh: Mesh) -> list[Int[np.ndarray, "f dim"]]:
     outside = boundary(mesh)
     ridges, _ = _ridges(outside)
     _, number = np.unique(ridges.reshape(-1, mesh.dimension - 1), axis=0, return_inverse=True)
-    number = number.reshape(len(outside), -1)
-    count = len(outside) + number.max() + 1
-    pairs = np.repeat(np.arange(len(outside)), number.shape[1]), len(outside) + number.ravel()
-    _, label = connected_components(coo_array((np.ones(number.size), pairs), shape=(count, count)))
-    parts = [outside[label[: len(outside)] == part] for part in np.unique(label[: len(outside)])]
+    label = connected(number.reshape(len(outside), -1))
+    parts = [outside[label == part] for part in range(label.max() + 1)]
     return sorted(parts, key=lambda part: -float(enclosed_volume(mesh.vertices, part)))
 
 
@@ -52,11 +46,6 @@ def inner_surface(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
     if not walls:
         raise InputError("the body has no closed cavity; name the facets of the chamber, and cap its openings")
     return np.concatenate(walls)
-
-
-def outer_surface(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
-    """Returns the outer surface of all bodies of a mesh, without the walls of cavities."""
-    return np.concatenate([part for part in surface_parts(mesh) if enclosed_volume(mesh.vertices, part) > 0])
 
 
 def facets_in(mesh: Mesh, name: str) -> Int[np.ndarray, "f dim"]:
@@ -131,17 +120,16 @@ def facet_nodes(mesh: Mesh, facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray,
     if mesh.midsides is None:
         return facets
     sides = np.array([[0, 1]] if mesh.dimension == 2 else SIDES[2])
-    size = np.array([len(mesh.vertices), 1])
-    keys = np.sort(mesh.elements[:, np.array(SIDES[mesh.dimension])].reshape(-1, 2), axis=1) @ size
-    order = np.argsort(keys)
-    wanted = np.sort(facets[:, sides], axis=2) @ size
-    place = order[np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)]
-    if len(missing := np.argwhere(keys[place] != wanted)):
-        edge = facets[missing[0][0], sides[missing[0][1]]].tolist()
+    edges = np.sort(mesh.elements[:, np.array(SIDES[mesh.dimension])].reshape(-1, 2), axis=1)
+    middles = dict(zip(map(tuple, edges.tolist()), mesh.midsides.ravel().tolist(), strict=True))
+    wanted = np.sort(facets[:, sides], axis=2).tolist()
+    try:
+        nodes = [[middles[tuple(edge)] for edge in of_facet] for of_facet in wanted]
+    except KeyError as error:
         raise InputError(
-            f"edge {edge} of a facet is not an edge of the quadratic mesh; only linear meshes can have caps"
-        )
-    return np.concatenate([facets, mesh.midsides.reshape(-1)[place]], axis=1)
+            f"edge {list(error.args[0])} of a facet is no edge of the quadratic mesh; only linear meshes can have caps"
+        ) from None
+    return np.append(facets, nodes, axis=1)
 
 
 def enclosed_volume(x: Float[AnyArray, "n dim"], nodes: Int[np.ndarray, "f nodes"]) -> Any:
@@ -191,41 +179,34 @@ def _open_ridges(facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "g d"]:
 def _oriented(mesh: Mesh, facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "f dim"]:
     """Turns facets of the boundary to point into the body, and others like their neighbours."""
     outside = {frozenset(facet): facet for facet in boundary(mesh).tolist()}
-    ridges, _ = _ridges(facets)
+    inward = [outside.get(frozenset(facet), [])[::-1] for facet in facets.tolist()]
     owners: dict[tuple, list[int]] = {}
-    for facet, of_facet in enumerate(ridges.tolist()):
-        for ridge in of_facet:
+    for facet, ridges in enumerate(_ridges(facets)[0].tolist()):
+        for ridge in ridges:
             owners.setdefault(tuple(ridge), []).append(facet)
-    turned: dict[int, list[int]] = {}
-    for number, facet in enumerate(facets.tolist()):
-        if (known := outside.get(frozenset(facet))) is not None:
-            turned[number] = known[::-1]
-    _spread(turned, list(turned), facets, owners)
-    for number in range(len(facets)):
-        if number not in turned:
-            turned[number] = facets[number].tolist()
-            part = _spread(turned, [number], facets, owners)
-            if enclosed_volume(mesh.vertices, np.array([turned[i] for i in part])) < 0:
-                for i in part:
-                    turned[i] = turned[i][::-1]
+    turned = {facet: known for facet, known in enumerate(inward) if known}
+    for start in sorted(range(len(facets)), key=lambda facet: not inward[facet]):
+        if start in turned and not inward[start]:
+            continue
+        turned.setdefault(start, facets[start].tolist())
+        part = [start]
+        for facet in part:  # which grows by its neighbours
+            for ridge, sign in _passages(turned[facet]):
+                both = owners[ridge]
+                for other in both if len(both) == 2 else ():
+                    if other not in turned:
+                        same = (ridge, -sign) in _passages(facets[other])
+                        turned[other] = facets[other].tolist()[:: 1 if same else -1]
+                        part.append(other)
+        if not inward[start] and enclosed_volume(mesh.vertices, np.array([turned[i] for i in part])) < 0:
+            turned |= {i: turned[i][::-1] for i in part}
     return np.array([turned[number] for number in range(len(facets))])
 
 
-def _spread(turned: dict[int, list[int]], front: list[int], facets: np.ndarray, owners: dict) -> list[int]:
-    """Turns neighbours like these facets, and theirs in turn; returns the given facets and all that were turned."""
-    reached = list(front)
-    while front:
-        facet = front.pop()
-        for ridge, sign in zip(*(part[0].tolist() for part in _ridges(np.array([turned[facet]]))), strict=True):
-            both = owners[tuple(ridge)]
-            for other in both if len(both) == 2 else ():
-                if other not in turned:
-                    candidate = facets[other].tolist()
-                    passed, signs = (part[0].tolist() for part in _ridges(np.array([candidate])))
-                    turned[other] = candidate if signs[passed.index(ridge)] == -sign else candidate[::-1]
-                    front.append(other)
-                    reached.append(other)
-    return reached
+def _passages(facet: Any) -> list[tuple[tuple[int, ...], int]]:
+    """Returns the ridges of one facet, each with its direction."""
+    ridges, signs = _ridges(np.array([facet]))
+    return [(tuple(ridge), sign) for ridge, sign in zip(ridges[0].tolist(), signs[0].tolist(), strict=True)]
 
 
 def _caps(facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "c dim"]:

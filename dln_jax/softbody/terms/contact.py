@@ -24,14 +24,15 @@ A point mass that hits at speed u rebounds at e u, whatever its mass, k and phi 
     c u (1 + e) = ln((1 + c u) / (1 - c e u))
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+from scipy.optimize import brentq
 
-from dln_jax.softbody.terms.penalty import penalty, penalty_force, penalty_integral
 from dln_jax.softbody.terms.term import (
     NOT_NEGATIVE,
     Context,
@@ -43,9 +44,9 @@ from dln_jax.softbody.terms.term import (
     material,
     require_dimension,
     vector,
-    vertex_list,
+    vertex_rows,
 )
-from dln_jax.types import Scalar, require_positive
+from dln_jax.types import InputError, Scalar, require_positive
 
 # Below this ratio of squared slip to squared threshold, the cubic part of f is rounding and its derivatives overflow.
 _NO_SLIP = 1e-16
@@ -105,7 +106,7 @@ def plane_contact(
     require_positive(threshold_speed=threshold_speed)
     if width != 0.0:
         require_positive(width=width)
-    indices = vertex_list("vertices in contact", vertices)
+    indices = vertex_rows("vertices in contact", vertices, 1)
     count = len(indices)
     parameters = PlaneContact(
         vector("the normal of a plane", normal, zero_allowed=False),
@@ -196,3 +197,49 @@ def friction_energy(x: Any, slip: Slip) -> Scalar:
     root = jnp.sqrt(jnp.where(slipping, ratio, 1.0))
     cubic = jnp.where(slipping, ratio * root, 0.0)
     return slip.force * (slip.threshold * jnp.where(ratio < 1.0, ratio - cubic / 3.0, root - 1.0 / 3.0))
+
+
+def penalty(distance: Float[Array, "*m"], width: float) -> Float[Array, "*m"]:
+    """Returns phi(d) in m²."""
+    if width == 0.0:
+        return jnp.where(distance < 0, 0.5 * distance**2, 0.0)
+    ramp = jnp.where(distance < 0, -(distance**3) / (6.0 * width), 0.0)
+    return jnp.where(distance < -width, 0.5 * distance * (distance + width) + width**2 / 6.0, ramp)
+
+
+def penalty_force(distance: Float[Array, "*m"], width: float) -> Float[Array, "*m"]:
+    """Returns -phi'(d) in m, the normal force divided by k."""
+    if width == 0.0:
+        return jnp.where(distance < 0, -distance, 0.0)
+    ramp = jnp.where(distance < 0, distance**2 / (2.0 * width), 0.0)
+    return jnp.where(distance < -width, -distance - 0.5 * width, ramp)
+
+
+def penalty_integral(distance: Float[Array, "*m"], width: float) -> Float[Array, "*m"]:
+    """Returns Phi(d) in m³, the integral of phi from 0."""
+    if width == 0.0:
+        return jnp.where(distance < 0, distance**3 / 6.0, 0.0)
+    ramp = jnp.where(distance < 0, -(distance**4) / (24.0 * width), 0.0)
+    deep = distance**3 / 6.0 + width * distance**2 / 4.0 + width**2 * distance / 6.0 + width**3 / 24.0
+    return jnp.where(distance < -width, deep, ramp)
+
+
+def damping_of_restitution(restitution: float, speed: float) -> float:
+    """Returns the damping c in s/m that makes a point mass rebound at `restitution` times its speed, in m/s.
+
+    c suits this speed only: slower impacts rebound faster, at 1 - 2/3 c u for small c u. A body also turns some of the
+    energy into its own vibrations, which is not a loss of the contact.
+
+    Raises:
+        InputError: the speed is not positive, or the coefficient is not between 0.05 and 1.
+    """
+    require_positive(speed=speed)
+    if not 0.05 <= restitution <= 1.0:
+        raise InputError(f"restitution is {restitution}; expected a coefficient from 0.05 to 1")
+    if restitution == 1.0:
+        return 0.0
+
+    def excess(z: float) -> float:
+        return math.log1p(z) - math.log1p(-restitution * z) - z * (1 + restitution)
+
+    return float(brentq(excess, 0.1 * (1 - restitution), (1 - 1e-15) / restitution)) / speed  # pyright: ignore

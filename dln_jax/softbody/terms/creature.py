@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.simplices import determinant
 from dln_jax.softbody.terms.elasticity import rest_geometry, shape_gradients
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.springs import muscles as driven_springs
 from dln_jax.softbody.terms.strain_energies import DeformationGradient, squared_norm
 from dln_jax.softbody.terms.term import Context, Corners, Indices, Term

@@ -19,7 +19,7 @@ from dln_jax.softbody.mesh.mesh import Mesh, indices_of
 from dln_jax.softbody.terms.elasticity import quadratic_geometry, rest_geometry, shape_gradients
 from dln_jax.softbody.terms.springs import length_of
 from dln_jax.softbody.terms.strain_energies import DeformationGradient
-from dln_jax.softbody.terms.term import NOT_NEGATIVE, Context, Corners, Numbers, Term, control_of, material
+from dln_jax.softbody.terms.term import NOT_NEGATIVE, Context, Corners, Numbers, Term, material, value_or_control
 from dln_jax.solvers.elements.energies import combinations
 from dln_jax.types import InputError, Scalar
 
@@ -74,8 +74,16 @@ def fibres(
             f"groups are {group.dtype} of shape {list(group.shape)}; expected [{count}] integers from 0 on"
         )
     number = int(group.max()) + 1
+    ways = jnp.asarray(direction, dtype=float)
+    if ways.shape not in ((mesh.dimension,), (count, mesh.dimension)):
+        one = f"[{mesh.dimension}], or [{count}, {mesh.dimension}]: per element"
+        raise InputError(f"direction has shape {list(ways.shape)}; expected {one}")
+    if not isinstance(ways, Tracer):
+        lengths = np.atleast_1d(np.linalg.norm(np.asarray(ways), axis=-1))
+        if (wrong := ~(np.isfinite(lengths) & (lengths > 0))).any():
+            raise InputError(f"the direction of fibres {np.argmax(wrong)} has no length; expected a unit vector")
     parameters = Fibres(
-        _directions(direction, count, mesh.dimension),
+        ways,
         material("strength", strength, count, "element", NOT_NEGATIVE),
         None if activation is None else material("activation", activation, number, "group", NOT_NEGATIVE),
         None if stiffness is None else material("stiffness", stiffness, count, "element"),
@@ -83,9 +91,8 @@ def fibres(
     nodes = mesh.nodes[chosen]
 
     def prepare(parameters: Fibres, context: Context) -> tuple[Any, ...]:
-        activation = parameters.activation
-        if activation is None:
-            activation = control_of(name, context, (number,), "the activation of every group of fibres, from 0 to 1")
+        meaning = "the activation of every group of fibres, from 0 to 1"
+        activation = value_or_control(parameters.activation, name, context, (number,), meaning)
         geometry = jax.vmap(rest_geometry if mesh.midsides is None else quadratic_geometry)(context.rest[nodes])
         direction = jnp.broadcast_to(parameters.direction, (count, mesh.dimension))
         unit = direction / jnp.linalg.norm(direction, axis=1, keepdims=True)
@@ -112,16 +119,3 @@ def fibres(
     if mesh.midsides is None:
         return Term(name, nodes, energy, parameters, prepare, control=control, weights=shape_gradients, mesh=mesh)
     return Term(name, nodes, quadratic_energy, parameters, prepare, unrolled=False, control=control, mesh=mesh)
-
-
-def _directions(direction: Numbers, count: int, dimension: int) -> Float[Array, "*m dim"]:
-    result = jnp.asarray(direction, dtype=float)
-    if result.shape not in ((dimension,), (count, dimension)):
-        raise InputError(
-            f"direction has shape {list(result.shape)}; expected [{dimension}], or [{count}, {dimension}]: per element"
-        )
-    if not isinstance(result, Tracer):
-        lengths = np.atleast_1d(np.linalg.norm(np.asarray(result), axis=-1))
-        if (wrong := ~(np.isfinite(lengths) & (lengths > 0))).any():
-            raise InputError(f"the direction of fibres {np.argmax(wrong)} has no length; expected a unit vector")
-    return result

@@ -107,8 +107,16 @@ def material(
     return result
 
 
-def control_of(name: str, context: Context, shape: tuple[int, ...], meaning: str) -> Float[Array, "..."]:
-    """Returns the control of a driven term (a number as [] or [1]); if it is missing, `InputError` explains it."""
+def value_or_control(
+    value: Any, name: str, context: Context, shape: tuple[int, ...], meaning: str
+) -> Float[Array, "..."]:
+    """Returns a parameter, or in place of `None` the control of the term (a number as [] or [1]).
+
+    Raises:
+        InputError: the control is missing or has another shape; the message explains it.
+    """
+    if value is not None:
+        return value
     control = context.control
     if control is None or (jnp.shape(control) != shape and not jnp.size(control) == math.prod(shape) == 1):
         got = "no control" if control is None else f"a control of shape {jnp.shape(control)}"
@@ -136,29 +144,19 @@ def require_dimension(name: str, components: int, dimension: int) -> None:
         raise InputError(f"{name} has {components} components in a scene of dimension {dimension}")
 
 
-def vertex_list(name: str, vertices: Indices) -> Int[np.ndarray, "m 1"]:
-    """Returns distinct vertices as elements of one corner."""
-    indices = _indices(name, vertices, 1)
-    if len(np.unique(indices)) < len(indices):
-        raise InputError(f"{name} names a vertex twice; expected each vertex once")
-    return indices[:, None]
-
-
-def vertex_pairs(name: str, pairs: Indices) -> Int[np.ndarray, "m 2"]:
-    """Returns validated pairs of distinct vertices."""
-    indices = _indices(name, pairs, 2)
-    if (loops := np.flatnonzero(indices[:, 0] == indices[:, 1])).size:
-        raise InputError(f"{name}: pair {loops[0]} joins vertex {indices[loops[0], 0]} to itself")
-    return indices
-
-
-def _indices(name: str, values: Indices, axes: int) -> np.ndarray:
+def vertex_rows(name: str, values: Indices, corners: int) -> Int[np.ndarray, "m corners"]:
+    """Returns distinct vertices as elements of one corner, or pairs of different vertices as elements of two."""
     indices = np.asarray(values)
-    shape = "[m]" if axes == 1 else "[m, 2]"
-    if indices.ndim != axes or (axes == 2 and indices.shape[1] != 2) or indices.size == 0:
+    if indices.ndim != corners or indices.shape[1:] != (2,) * (corners - 1) or indices.size == 0:
+        shape = "[m]" if corners == 1 else "[m, 2]"
         raise InputError(f"{name} has shape {indices.shape}; expected {shape} with m >= 1; leave the term out if none")
     if not np.issubdtype(indices.dtype, np.integer):
         raise InputError(f"{name} has type {indices.dtype}; expected integer indices of vertices")
     if indices.min() < 0:
         raise InputError(f"{name} contains the index {indices.min()}; expected indices from 0 on")
-    return indices
+    rows = indices.reshape(-1, corners)
+    if corners == 1 and len(np.unique(rows)) < len(rows):
+        raise InputError(f"{name} names a vertex twice; expected each vertex once")
+    if corners == 2 and (loops := np.flatnonzero(rows[:, 0] == rows[:, 1])).size:
+        raise InputError(f"{name}: pair {loops[0]} joins vertex {rows[loops[0], 0]} to itself")
+    return rows

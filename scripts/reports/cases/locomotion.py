@@ -9,19 +9,29 @@ import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium.wrappers import TransformReward
+from jaxtyping import Float
 
 from dln_jax.data.arrays import load_file
-from dln_jax.locomotion.environment import CreatureEnvironment
-from dln_jax.locomotion.frames import Frame
-from dln_jax.locomotion.gradient import shown_walk, train
-from dln_jax.locomotion.learning import GOAL, Goal, Parameters, Policy, Record, median_to_reach
-from dln_jax.locomotion.perturbed import STEPS, numbers_of, perturbed_trials
-from dln_jax.locomotion.task import POSITION_UNIT, LocomotionTask, make_task
+from dln_jax.locomotion.gradient import Parameters, Policy, shown_walk
+from dln_jax.locomotion.learning import GOAL, STEPS, Record, median_to_reach, numbers_of, perturbed_trials, train
+from dln_jax.locomotion.task import (
+    FALLEN,
+    POSITION_UNIT,
+    Frame,
+    LocomotionTask,
+    advance,
+    beginning,
+    change_of,
+    make_task,
+    observe,
+)
 from dln_jax.locomotion.worlds import FLAT, Variation
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import Creature, crawler
@@ -39,6 +49,52 @@ KEYS = tuple(f"biped_{name}" for name in NAMES)
 """Arrays of the published creature's file."""
 
 
+class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
+    """Environment of one creature for learners of other libraries, in NumPy and float32, with the task's rewards.
+
+    Actions in [-1, 1] are commands: the actuation approaches theirs by at most 0.3 per step. An episode is truncated
+    after the task's number of steps. It is terminated by a fall, or by a step of the simulator that does not converge;
+    `info["converged"]` distinguishes the two.
+    """
+
+    def __init__(self, task: LocomotionTask):
+        self.task = task
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (task.muscle_count,), np.float32)
+        self._place = beginning(task)
+        self._begin = jax.jit(lambda key: beginning(task, key))
+        self._advance = jax.jit(lambda place, action: advance(task, place, change_of(place.actuation, action)))
+        self._observe = jax.jit(lambda place: observe(task, place))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Float[np.ndarray, " o"], dict[str, Any]]:
+        """Returns the observation of a start perturbed by the task's variation; without one, at rest.
+
+        Raises:
+            InputError: there are options, of which this environment has none.
+        """
+        if options:
+            raise InputError(f"reset got the options {', '.join(options)}; this environment has none")
+        super().reset(seed=seed, options=options)
+        self._place = self._begin(jax.random.key(int(self.np_random.integers(2**31))))
+        return self._observation(), {}
+
+    def step(
+        self, action: Float[np.ndarray, " k"]
+    ) -> tuple[Float[np.ndarray, " o"], float, bool, bool, dict[str, Any]]:
+        """Returns observation, reward, terminated, truncated, and `info` with "x" [n, dim] in m and "converged"."""
+        self._place, seen = self._advance(self._place, np.asarray(action, self._place.state.x.dtype))
+        converged = bool(seen.converged)
+        terminated = not converged or float(seen.tilt) > FALLEN
+        truncated = int(self._place.steps) >= self.task.episode
+        info = {"x": np.asarray(seen.x), "converged": converged}
+        return self._observation(), float(seen.reward), terminated, truncated, info
+
+    def _observation(self) -> Float[np.ndarray, " o"]:
+        return np.asarray(self._observe(self._place), np.float32)
+
+
 def measure_comparison(*, rivals: tuple[str, ...] = ("ppo",), seeds: int = 3, steps: int = 300_000) -> Numbers:
     """Environment steps and seconds of each method until five body lengths, and their ratio to gradients.
 
@@ -48,10 +104,10 @@ def measure_comparison(*, rivals: tuple[str, ...] = ("ppo",), seeds: int = 3, st
     """
     if unknown := set(rivals) - {"ppo"}:
         raise InputError(f"--rivals names {unknown.pop()!r:.40}; choose from ppo")
-    task, goal = make_task(crawler()), Goal(steps, UNTIL)
-    curves = {"gradient": [one.records for one in train(task, seeds=range(seeds), goal=goal).learned]}
+    task = make_task(crawler())
+    curves = {"gradient": [one.records for one in train(task, seeds=range(seeds), steps=steps, until=UNTIL)]}
     if rivals:
-        curves["ppo"] = [learn_by_ppo(task, seed, goal) for seed in range(seeds)]
+        curves["ppo"] = [learn_by_ppo(task, seed, steps) for seed in range(seeds)]
     numbers: dict[str, dict[str, float]] = {}
     needed = {}
     for method, records in curves.items():
@@ -68,7 +124,7 @@ def measure_comparison(*, rivals: tuple[str, ...] = ("ppo",), seeds: int = 3, st
     return numbers
 
 
-def learn_by_ppo(task: LocomotionTask, seed: int, goal: Goal, *, lanes: int = 16, rollout: int = 80) -> list[Record]:
+def learn_by_ppo(task: LocomotionTask, seed: int, steps: int, *, lanes: int = 16, rollout: int = 80) -> list[Record]:
     """Proximal policy optimisation (Schulman et al. 2017) by stable-baselines3; evaluates after every update."""
     try:
         import torch  # pyright: ignore[reportMissingImports]
@@ -90,7 +146,7 @@ def learn_by_ppo(task: LocomotionTask, seed: int, goal: Goal, *, lanes: int = 16
         policy_kwargs={"net_arch": [64, 64], "log_std_init": math.log(0.6)},
     )  # fmt: skip
     records: list[Record] = []
-    while model.num_timesteps < goal.steps and not (records and records[-1].distance >= goal.distance):
+    while model.num_timesteps < steps and not (records and records[-1].distance >= UNTIL):
         model.learn(lanes * rollout, reset_num_timesteps=not records)
         seen, _ = one.reset()
         last, ended = 0.0, False

@@ -23,7 +23,7 @@ from dln_jax.softbody.scene import Params, SoftScene, make_scene, with_parameter
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.strain_energies import (
     DeformationGradient,
     squared_norm,

@@ -14,9 +14,7 @@ import numpy as np
 from dln_jax.softbody.contact.crossings import crossings
 from dln_jax.softbody.contact.distances import POINT_TRIANGLE, squared_distance
 from dln_jax.softbody.mesh.mesh import Mesh, boundary, components, lumped_masses, vertices_where
-from dln_jax.softbody.mesh.placement import join, rotate, translate
-from dln_jax.softbody.mesh.quadratic import quadratic
-from dln_jax.softbody.mesh.shapes import box
+from dln_jax.softbody.mesh.shapes import box, join, quadratic, rotate, translate
 from scripts.reports.run import Numbers
 from scripts.reports.soft_bodies.body import (
     DENSITY,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dln_jax.softbody.contact.bodies import body_contact
-from dln_jax.softbody.contact.surface import surface_of
+from dln_jax.softbody.contact.candidates import surface_of
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.terms.term import Context
@@ -36,7 +36,7 @@ def ours(mesh):
 
 def reference(mesh, x):
     surface = surface_of(mesh)
-    faces = surface.triangles if mesh.dimension == 3 else np.zeros((0, 3), int)
+    faces = surface.facets if mesh.dimension == 3 else np.zeros((0, 3), int)
     collision_mesh = ipctk.CollisionMesh(np.asfortranarray(mesh.vertices), surface.edges, faces)
     assert collision_mesh.num_vertices == len(x)
     collisions = ipctk.NormalCollisions()

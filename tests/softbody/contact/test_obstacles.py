@@ -1,5 +1,7 @@
 """Rigid obstacles: distances, rest, bounces, Coulomb friction with iterated normal forces, and obstacles that move."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,7 @@ from impact_derivatives import require_gradient_of_differences
 from scipy.spatial.transform import Rotation
 
 from dln_jax.softbody.contact.barrier import barrier
-from dln_jax.softbody.contact.obstacles import Obstacle, box, capsule, half_space, heightfield, obstacle_contact, sphere
+from dln_jax.softbody.contact.obstacles import box, capsule, half_space, heightfield, obstacle_contact, sphere
 from dln_jax.softbody.integrators import AVERAGE_VECTOR_FIELD, BACKWARD_EULER
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import beam, disc
@@ -17,7 +19,7 @@ from dln_jax.softbody.scene import contact_energies, make_scene, potential, prep
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.contact import motion_of, plane_contact
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.loads import gravity
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.elements.moving import lists_between, moving_gradient
 
@@ -34,13 +36,12 @@ OBSTACLES = {
 @pytest.mark.parametrize("name", OBSTACLES)
 def test_a_distance_never_grows_faster_than_the_way_and_its_slope_leads_to_the_surface(name):
     # The bound of the steps rests on it: no vertex may be nearer than the distance says.
-    distance, shape = OBSTACLES[name]
-    evaluate = jax.jit(jax.vmap(jax.value_and_grad(distance), (0, None)))
+    evaluate = jax.jit(jax.vmap(jax.value_and_grad(OBSTACLES[name].distance)))
     x = np.random.default_rng(1).uniform(-1.2, 1.2, (500, 3))
-    d, slope = evaluate(x, shape)
+    d, slope = evaluate(x)
     assert jnp.linalg.norm(slope, axis=1).max() <= 1 + 1e-12 and (d > 0).sum() > 100
     if name != "heightfield":  # its distance is a lower bound
-        np.testing.assert_allclose(evaluate(x - d[:, None] * slope, shape)[0][d > 0], 0, atol=1e-12)
+        np.testing.assert_allclose(evaluate(x - d[:, None] * slope)[0][d > 0], 0, atol=1e-12)
 
 
 def block(bottom, length=0.2, height=0.1):
@@ -140,8 +141,8 @@ def test_derivatives_through_iterated_friction_with_a_moving_obstacle_agree_with
     ground = scene.params.terms["ground"]
 
     def outcome(values):
-        near = ground.contact._replace(stiffness=values[1], friction=values[2])
-        moved = {"contact": near, "shape": ground.shape._replace(offset=values[3])}
+        shape = ground.shape._replace(offset=values[3])
+        moved = {"stiffness": values[1], "friction": values[2], "shape": shape}
         params = with_parameters(scene.params, elastic={"youngs_modulus": values[0]}, ground=moved)
         state, info = jax.lax.scan(lambda state, _: step(params, state), init(v=[2.0, -1.0]), None, length=6)
         return jnp.sum(state.x[:, 0] ** 2) + jnp.sum(state.v[:, 1]), info.converged
@@ -267,8 +268,15 @@ def test_points_of_obstacles_move_rigidly():
         np.testing.assert_array_equal(moved(before, before), x, err_msg=name)
 
 
+class Level(NamedTuple):
+    height: jax.Array
+
+    def distance(self, x):
+        return x[1] - self.height
+
+
 def test_mistakes_with_obstacles_are_named():
-    mesh, own = block(0.004), Obstacle(lambda x, height: x[1] - height, jnp.asarray(0.0))
+    mesh, own = block(0.004), Level(jnp.asarray(0.0))
     near = {"distance": 5e-3, "stiffness": 1e4}
     with one_line("inside the obstacle 'ball'"):
         obstacle_contact(mesh, sphere([0.0, 0.0], 0.1), **near, name="ball")
