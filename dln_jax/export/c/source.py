@@ -8,6 +8,7 @@ import functools
 import importlib.metadata
 from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from dln_jax.export.c.interface import (
 from dln_jax.export.c.lowering import program_of, repeated_calls, traced
 from dln_jax.export.c.templates import CMAKE, NEEDED, demo, header, preamble
 from dln_jax.export.c.text import PRECISIONS, check_name, comment, kind_of
-from dln_jax.files import write_bytes
+from dln_jax.files import writing
 from dln_jax.precision import computing_in, require_precision
 from dln_jax.types import InputError, require_positive
 
@@ -189,7 +190,7 @@ def _function(
 
 
 def _write(directory: Path, files: Mapping[str, bytes], overwrite: bool) -> list[Path]:
-    """Writes the files, the description last: an interrupted export differs from its digest, which `load_c` refuses."""
+    """Writes all files or none, and the description last, whose digest `load_c` checks."""
     for path in filter(Path.is_file, directory.glob("*.json")):
         text = path.read_bytes()
         if b'"tensor_file"' in text:
@@ -207,6 +208,8 @@ def _write(directory: Path, files: Mapping[str, bytes], overwrite: bool) -> list
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{directory}: cannot write there ({error.strerror}); choose another folder") from error
-    for name, content in files.items():
-        write_bytes(directory / name, content)
+    with ExitStack() as stack:
+        # All files are complete before the first is renamed; the stack renames in reverse order.
+        for name in reversed(files):
+            stack.enter_context(writing(directory / name)).write_bytes(files[name])
     return [directory / name for name in files]
