@@ -15,7 +15,6 @@ import numpy as np
 
 from dln_jax import joint_dissipation, tree_system
 from dln_jax.control.closed_loop import Hardware, following, outcomes
-from dln_jax.control.desktop_plants import desktop_plant, law_of, nominal_model
 from dln_jax.control.mujoco_loop import simulate_in_mujoco
 from dln_jax.control.observers import with_differences
 from dln_jax.control.optimal.plants import PLANTS
@@ -145,8 +144,9 @@ def tracking(
 
 def laws_in_c(*, repeats: int = 9, calls: int = 1000, cold: int = 1000) -> Numbers:
     """Times of a call of laws as C: medians of warm calls, and quantiles of cold ones after reading 32 MiB or more."""
-    desk, problem = desktop_plant("rotary-pendulum"), PLANTS["cart-pole"]().problem
-    swing_up, joints = law_of(desk, nominal_model(desk)), desk.scene.needs.joints
+    problem, (layout, hardware) = PLANTS["cart-pole"]().problem, desk("furuta")
+    upright = upright_of(model_of("furuta", "analytic"), layout)
+    numbers, differences = swing_up_numbers(upright, USUAL), by_differences(layout)
     tree, network = dynamics(tree_system(arm(coulomb=False).tree)), value_network(problem, widths=(64, 64), scale=30.0)
     parameters = network.init(jax.random.key(0))
     of_states = {
