@@ -19,6 +19,7 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.control.closed_loop import Controller
+from dln_jax.control.plants.plant import Layout
 from dln_jax.control.plants.simulated import spread_of
 from dln_jax.control.real_time import improve
 from dln_jax.control.recovery import recovery_by_plans
@@ -92,7 +93,7 @@ def plan_problem(
     """
     layout, size, units = upright.layout, upright.forces, _units(upright)
     d, dt, goal = len(layout.joints), every / layout.rate, np.asarray(upright.at.x)
-    low, high = INSIDE * layout.limits.position.T
+    low, high = inner_ranges(layout, INSIDE)
     fastest = INSIDE * layout.limits.rate
     # Driven joints must not make extra turns, because their cables might not.
     free = circular(layout.joints, 2 * d) & np.isin(np.arange(2 * d), upright.parts.passive) & (soon > 0)
@@ -147,6 +148,13 @@ def plans_of(upright: Upright, *, seed: int = 0) -> list[Plan]:
         f"no plan of {DURATIONS[-1] / fall:.3g} s leads from hanging to the goal: the best ends {nearest:.2g} of a "
         "coordinate's size away; try a stronger motor or wider limits"
     )
+
+
+def inner_ranges(layout: Layout, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the ends [d] of the middle share of every finite range of the coordinates; infinite ends stay."""
+    low, high = layout.limits.position.T
+    spare = np.where(np.isfinite(high - low), (1 - share) / 2 * (high - low), 0.0)
+    return low + spare, high - spare
 
 
 def steps_of(upright: Upright, fineness: float = FINENESS) -> int:

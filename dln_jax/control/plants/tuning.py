@@ -23,7 +23,14 @@ from jax import Array
 
 from dln_jax.control.closed_loop import Controller, Hardware, simulate, stateless
 from dln_jax.control.plants.estimators import Estimator, by_differences
-from dln_jax.control.plants.planned import TrackedPlan, by_repeated_plans, follower, plans_of, with_feedback
+from dln_jax.control.plants.planned import (
+    TrackedPlan,
+    by_repeated_plans,
+    follower,
+    inner_ranges,
+    plans_of,
+    with_feedback,
+)
 from dln_jax.control.plants.plant import Layout
 from dln_jax.control.plants.runs import HELD, SPAN, TOLERANCE
 from dln_jax.control.plants.simulated import spread_of
@@ -277,9 +284,7 @@ def trial_of(
     lower, upper = layout.limits.control.T
     limited = hardware._replace(lower=lower, upper=upper, sees_rates=False)
     angles = np.array([kind == "revolute" for kind in layout.joints])
-    low, high = layout.limits.position.T
-    spare = np.where(np.isfinite(high - low), (1 - RESERVE) / 2 * (high - low), 0.0)
-    low, high = low + spare, high - spare
+    low, high = inner_ranges(layout, RESERVE)
     has_limits = np.isfinite(layout.limits.position).any() or np.isfinite(layout.limits.rate).any()
 
     def within(q: Array, qd: Array) -> Array:
