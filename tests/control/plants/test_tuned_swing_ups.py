@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from dln_jax.control.closed_loop import Hardware, simulate, stateless
 from dln_jax.control.plants.exploring import NEAR, Exploration, explore
-from dln_jax.control.plants.planned import by_repeated_plans
+from dln_jax.control.plants.planned import by_repeated_plans, inner_ranges
 from dln_jax.control.plants.plant import layout
 from dln_jax.control.plants.runs import compiled, distances, judged_runs, run, start_of
 from dln_jax.control.plants.simulated import plant_of
@@ -60,6 +60,11 @@ def test_similar_plants_get_the_same_law_in_their_own_units():
     # k E M_ap qd_p is an acceleration, where E and M_ap grow by 3 each.
     assert other.gains.energy == pytest.approx(one.gains.energy / 9, rel=1e-6)
     assert_allclose(other.gains[1:3], one.gains[1:3], rtol=1e-6)
+
+
+def test_a_share_of_a_range_is_its_middle():
+    limits = rail().limits._replace(position=np.array([[1.0, 2.0], [-np.inf, 3.0]]))
+    assert_allclose(inner_ranges(rail()._replace(limits=limits), 0.8), [[1.1, -np.inf], [1.9, 3.0]])
 
 
 def test_on_the_surface_of_the_catch_region_the_regulator_asks_for_the_motors_limit():
