@@ -1,19 +1,17 @@
 """Swing up a pole with a model that was learned from it: explore the plant, learn, design a controller, close the loop.
 
-The simulated plants have dry friction, limits, encoders, noise and torques that act a sample late, at 500 Hz. They are
-explored without a model; only q and the commanded torques are recorded. Models: delan (a structured deep Lagrangian
-network with friction), identified (linear in its parameters), analytic (the nominal dimensions, no friction), known
-(the plant itself). All use the same energy law, regulator and friction compensation, with the same gains, and get their
-states from a Kalman filter of the model. A run folder gets data.npz, the model, metrics.json, config.json, and a figure
-and an animation of the runs.
+The plant is an MJCF or URDF file: a cart-pole, a rotary pendulum, an acrobot, a pendubot, or another chain with a
+passive joint; cart-pole and furuta name two files of the library, desktop plants with dry friction. MuJoCo simulates
+it, with encoders and torques that act a sample late. It is explored without a model; only q and the commanded torques
+are recorded. Models: identified (rigid bodies, linear in its parameters), delan (a structured deep Lagrangian network
+with friction), known (the file's bodies and friction), analytic (the same without friction). Trials of the model choose
+all gains, and the law gets its states from a Kalman filter of the model.
 
---plant also takes an MJCF or URDF file: a cart-pole, a rotary pendulum, an acrobot, a pendubot, or another chain with a
-passive joint. MuJoCo simulates it, with encoders and torques that act a sample late. It is explored without a model of
-it, the model is identified, and trials of the model choose all gains (law.json).
+A run folder gets data.npz, the model, law.json, metrics.json, config.json, and a figure of the runs.
 """
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from dln_jax.options import Drawn, Folder, Unstated, choice
 
@@ -22,18 +20,18 @@ from dln_jax.options import Drawn, Folder, Unstated, choice
 class Arguments(Folder, Drawn):
     """Plant, model, and where the results go."""
 
-    plant: Annotated[str, choice(("rotary-pendulum", "cart-pole", "furuta", "FILE"))] = "rotary-pendulum"
-    """The plant; furuta is another name of the rotary pendulum. FILE is the path of an MJCF or URDF file."""
+    plant: Annotated[str, choice(("rotary-pendulum", "cart-pole", "FILE"))] = "furuta"
+    """The plant; furuta is a rotary pendulum. FILE is the path of an MJCF or URDF file."""
     actuated: Unstated[str] = None
-    """Joints of the file with a motor, comma-separated names or numbers from 0 (default: those with an actuator or
-    a transmission)."""
+    """Joints with a motor, comma-separated names or numbers from 0 (default: those with an actuator or a
+    transmission)."""
     control: Unstated[float] = None
-    """Largest force of the motors of the file, N m or N (default: as stated in the file)."""
-    model: Annotated[Unstated[str], choice(("delan", "identified", "analytic", "known"), unstated=True)] = None
-    """Model for the design of the controller (default: delan; for a file, identified)."""
-    estimator: Annotated[str, choice(("extended", "unscented", "differences"))] = "extended"
+    """Largest force of the motors, N m or N (default: as stated in the file)."""
+    model: Literal["identified", "delan", "known", "analytic"] = "identified"
+    """Model for the design of the controller."""
+    estimator: Literal["extended", "unscented", "differences"] = "extended"
     """Where the law's states come from: a Kalman filter of the encoders' readings, or their differences."""
-    recover: Annotated[str, choice(("swing-up", "plans"))] = "swing-up"
+    recover: Literal["swing-up", "plans"] = "swing-up"
     """How the plant comes up again after a push: as from hanging, or by plans from the state after the push, which are
     improved on the way."""
     push: float = 0.0
@@ -48,6 +46,6 @@ class Arguments(Folder, Drawn):
 
 def main(options: Arguments) -> None:
     """Explores the plant, learns the model, swings up and writes the run folder; a refused law exits with status 1."""
-    from dln_jax.commands.swing_ups.run import swing_up
+    from dln_jax.commands.learned_plants import swing_up
 
     swing_up(options)

@@ -1,85 +1,126 @@
-"""Swing-ups by energy: a complete law, or a controller with an estimator, from a known or learned model.
-
-`swing_up` makes a complete law from a model:
+"""Swing-ups by energy, from a known or learned model, with gains and costs from the model's natural scales.
 
 1. The model's friction is removed: the rest has an energy and a smooth linearisation.
 2. The model's own equilibrium near the goal is computed, because a learned potential is not level exactly at the goal.
 3. Far from it the energy law acts, near it the regulator of the linearisation; the regulator's cost to go decides.
 4. A share of the friction of the active joints is compensated, at the measured rates.
 5. At rest the energy law returns zero and dry friction would hold the plant, so a kick starts it.
+
+With the active joints locked at the goal, the passive part falls from the goal at a rate lambda. It needs the energy E
+from its lowest to its highest posture, and swings at the speed w = √(2 E / M_pp) at most. Motors at their limits
+accelerate the active joints by a. Then
+
+    k_energy = energy · a / (E |M_ap| w),   k_p = (stiffness · lambda)²,   k_d = 2 damping · stiffness · lambda
+    Q = diag(1 / s², (rates / (s lambda))²),   R = effort / u²,   level = (catch · u)² / max(K S⁻¹ Kᵀ)
+
+with the limits u of the controls (in `level`, what holding the goal leaves of them), and errors s of equal cost:
+`PASSIVE` for passive angles, `reach` for an active angle in rad, and for a rail `reach` times g / lambda² or half the
+rail, whichever is shorter. On the surface of the catch region the regulator asks for at most `catch` times what the
+motors have to spare. The energy law aims `surplus` E above the goal, because friction takes energy away on the way up.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
 
-from dln_jax.control.closed_loop import Controller, stateless
-from dln_jax.control.energy_shaping import EnergyGains, Parts, energy_shaping, parts_of, with_energy
+from dln_jax.control.energy_shaping import EnergyGains, Parts, energy_shaping, parts_of, passive_energy, with_energy
+from dln_jax.control.plants.plant import Layout
 from dln_jax.control.regulators import Regulator, lqr, regulated, switched, value
 from dln_jax.control.state_space import Law, Linearisation, field_of, holding_controls, linearise
 from dln_jax.control.tracking import GAIN, definite, friction_compensation, without_friction
 from dln_jax.mechanics.dynamics import Dynamics, InverseForward
-from dln_jax.types import InputError, JointKind, Vector
+from dln_jax.types import InputError, Vector
 
 NEWTON_STEPS = 20
 FARTHEST = 0.1
 """Largest distance of a model's equilibrium from the goal, rad or m."""
+LEVEL = 1e-6
+"""Largest remaining torque at the equilibrium, N m or N."""
+STILL = 0.05
+"""Largest measured rate that counts as rest, 1/s or m/s."""
+PASSIVE = 0.2
+"""Error of a passive angle in Q, rad."""
+CIRCLE = 65
+"""Postures of a full turn."""
+RANGES: Mapping[str, tuple[float, float]] = {
+    "energy": (1.0, 20.0),
+    "stiffness": (0.2, 1.0),
+    "damping": (0.3, 1.5),
+    "reach": (0.15, 3.0),
+    "rates": (0.3, 4.0),
+    "effort": (2.0, 300.0),
+    "catch": (0.5, 6.0),
+    "kick": (0.3, 1.0),
+    "surplus": (0.01, 0.5),
+}
+"""Range of every number; draws are uniform in its logarithm."""
+USUAL = {name: float(np.sqrt(low * high)) for name, (low, high) in RANGES.items()}
+SMOOTHING = 0.05
+"""Smoothing of the friction compensation, as a share of lambda times the size of a coordinate."""
+
+
+class Scales(NamedTuple):
+    """Natural scales of a plant."""
+
+    fall: float
+    """lambda, 1/s."""
+    energy: float
+    """E, J."""
+    speed: float
+    """w, 1/s."""
+    coupling: float
+    """|M_ap| at the goal, kg m² or kg m."""
+    acceleration: float
+    """a, 1/s² or m/s²."""
+    sizes: np.ndarray
+    """Size of every coordinate [d]: 1 rad, and for a rail g / lambda² or half of the rail."""
+
+
+class Upright(NamedTuple):
+    """A checked model of a plant with its own equilibrium near the goal, and its scales."""
+
+    model: Dynamics
+    """With friction, if it has any."""
+    layout: Layout
+    parts: Parts
+    at: Linearisation
+    """Linearisation at the equilibrium, without friction."""
+    scales: Scales
+
+    @property
+    def forces(self) -> np.ndarray:
+        """Largest forces of the motors to either side [m], N m or N."""
+        return np.abs(self.layout.limits.control).min(axis=1)
+
+    @property
+    def rest(self) -> np.ndarray:
+        """State [2 d] of the plant that hangs at rest."""
+        return np.concatenate([self.layout.hanging, np.zeros(len(self.layout.joints))])
+
+    def controls(self, forces: Array) -> Array:
+        """The controls [m] of forces of the active joints: motors are ordered by columns of the actuation."""
+        return jnp.asarray(np.linalg.pinv(self.layout.actuation[np.array(self.parts.active)])) @ forces
 
 
 class SwingUpNumbers(NamedTuple):
-    """Settings of a plant's swing-up, the same for all models."""
+    """Settings of a swing-up, in SI units; all may be traced."""
 
     gains: EnergyGains
     state_cost: Any
     """Q [2 d, 2 d] of the regulator."""
     control_cost: Any
     """R [m, m]."""
-    level: float
-    """Largest cost to go at which the regulator acts."""
-    smoothing: Any
-    """Smoothing of the friction compensation, rad/s or m/s."""
-    compensation: float = GAIN
-    """Share of the active joints' friction that is compensated; 0 for none."""
-    kick: float = 0.0
-    """Kick in N m or N on a plant at rest far from the goal, towards the active joints' goal."""
-    still: float = 0.05
-    """Largest measured rate that counts as rest, 1/s or m/s."""
-    surplus: Any = 0.0
-    """Target energy above that of the goal, J, which compensates losses of the passive joints."""
-
-
-class SwingUp(NamedTuple):
-    """A swing-up law with its equilibrium and regulator."""
-
-    law: Law
-    controller: Controller
-    """Controller of measurements, by the estimator; without one, of states."""
-    equilibrium: Float[Array, " two_d"]
-    """The model's own equilibrium near the goal."""
-    controls: Float[Array, " m"]
-    """Controls that hold it."""
     regulator: Regulator
-
-    @property
-    def offset(self) -> float:
-        """Largest coordinate of the equilibrium, rad or m, for a goal at zero."""
-        return float(jnp.max(jnp.abs(self.equilibrium)))
-
-
-class Upright(NamedTuple):
-    """A checked model with its own equilibrium near the goal, as a swing-up needs them."""
-
-    model: Dynamics
-    """With friction, if it has any."""
-    parts: Parts
-    B: Float[np.ndarray, "d m"]
-    at: Linearisation
-    """Linearisation at the equilibrium, without friction."""
+    level: Any
+    """Largest cost to go at which the regulator acts."""
+    kick: Any
+    """Kick in N m or N on a plant at rest far from the goal, towards the active joints' goal."""
+    surplus: Any
+    """Target energy above that of the goal, J, which compensates losses of the passive joints."""
 
 
 def nearest_equilibrium(plant: Dynamics, goal: Any, passive: Sequence[int]) -> Vector:
@@ -107,105 +148,118 @@ def nearest_equilibrium(plant: Dynamics, goal: Any, passive: Sequence[int]) -> V
     return goal.at[free].set(angles)
 
 
-def swing_up(
-    model: Dynamics | InverseForward,
-    actuation: Any,
-    joints: tuple[JointKind, ...],
-    goal: Any,
-    numbers: SwingUpNumbers,
-    *,
-    postures: Any,
-    estimator: Callable[[Law], Controller] = stateless,
-    lower: Any = -jnp.inf,
-    upper: Any = jnp.inf,
-    tolerance: float = 1e-6,
-) -> SwingUp:
-    """Returns the law x -> u of a swing-up by a model, and its controller of measurements.
-
-    Args:
-        model: known or learned, with friction or without.
-        actuation: matrix [d, m]; every motor drives one coordinate.
-        joints: kinds of the joints.
-        goal: posture [d].
-        numbers: gains and costs.
-        postures: [n, d], postures of a swing-up; the model must be usable in all of them.
-        estimator: law -> controller of measurements, such as `plants.by_filter`; by default states are measured.
-        lower: lower limits of the controls.
-        upper: upper limits of the controls.
-        tolerance: largest remaining torque at the equilibrium, N m or N.
+def upright_of(model: Dynamics | InverseForward, layout: Layout) -> Upright:
+    """Checks a known or learned model of a plant, computes its equilibrium near the goal, and its scales.
 
     Raises:
-        InputError: the model has no energy, no definite mass matrix or no equilibrium near the goal; or the limits
-            cannot hold the equilibrium, or no feedback stabilises it.
+        InputError: the model has no energy, no definite mass matrix or no equilibrium near the goal; the limits cannot
+            hold the equilibrium; or the passive joints do not fall from it.
     """
-    upright = upright_of(
-        model, actuation, goal, postures=postures, lower=lower, upper=upper, tolerance=tolerance
-    )  # fmt: skip
-    with jax.ensure_compile_time_eval():
-        regulator = lqr(upright.at.A, upright.at.B, numbers.state_cost, numbers.control_cost)
-    law = law_at(upright, joints, numbers, regulator)
-    return SwingUp(law, estimator(law), upright.at.x, upright.at.u, regulator)
+    parts, (lower, upper) = parts_of(layout.actuation), layout.limits.control.T
+    model = with_energy(model)
+    sound = np.asarray(jax.jit(jax.vmap(lambda q: definite(model, q)))(circle(layout)))
+    if not sound.all():
+        raise InputError(
+            f"the model's mass matrix is not positive definite in {np.mean(~sound):.1%} of the postures that a "
+            "swing-up goes through; learn a model that is by construction, such as a structured DeLaN, or use more "
+            "motions"
+        )
+    conservative = without_friction(model)
+    # Compiled, because they take longer operation by operation.
+    inverse, forward = jax.jit(conservative.inverse_dynamics), jax.jit(conservative.forward_dynamics)
+    whole = conservative._replace(inverse_dynamics=inverse, forward_dynamics=forward)
+    home = nearest_equilibrium(whole, layout.goal, parts.passive)
+    controls = holding_controls(whole, home, layout.actuation, tolerance=LEVEL)
+    if not bool(jnp.all((controls > lower) & (controls < upper))):
+        raise InputError(
+            f"the limits {lower} to {upper} do not hold the goal, which takes {np.round(controls, 4).tolist()}; "
+            "choose another goal, or a stronger motor"
+        )
+    x = jnp.concatenate([home, jnp.zeros_like(home)])
+    at = linearise(field_of(whole, layout.actuation), x, controls, tolerance=np.inf)
+    return Upright(model, layout, parts, at, _scales(conservative, layout, parts, home))
 
 
-def upright_of(
-    model: Dynamics | InverseForward,
-    actuation: Any,
-    goal: Any,
-    *,
-    postures: Any,
-    lower: Any = -jnp.inf,
-    upper: Any = jnp.inf,
-    tolerance: float = 1e-6,
-) -> Upright:
-    """Checks a model and computes its equilibrium near the goal; arguments and errors as for `swing_up`."""
-    parts, B = parts_of(actuation), np.asarray(actuation, float)
-    # Values that depend on the model only are computed now, even if gains or the level are being traced.
-    with jax.ensure_compile_time_eval():
-        model = with_energy(model)
-        sound = np.asarray(jax.jit(jax.vmap(lambda q: definite(model, q)))(jnp.asarray(postures, float)))
-        if not sound.all():
-            raise InputError(
-                f"the model's mass matrix is not positive definite in {np.mean(~sound):.1%} of the postures that a "
-                "swing-up goes through; learn a model that is by construction, such as a structured DeLaN, or use more "
-                "motions"
-            )
-        conservative = without_friction(model)
-        # Compiled, because they take longer operation by operation.
-        inverse, forward = jax.jit(conservative.inverse_dynamics), jax.jit(conservative.forward_dynamics)
-        whole = conservative._replace(inverse_dynamics=inverse, forward_dynamics=forward)
-        home = nearest_equilibrium(whole, goal, parts.passive)
-        controls = holding_controls(whole, home, B, tolerance=tolerance)
-        if not bool(jnp.all((controls > lower) & (controls < upper))):
-            raise InputError(
-                f"the limits {lower} to {upper} do not hold the goal, which takes {np.round(controls, 4).tolist()}; "
-                "choose another goal, or a stronger motor"
-            )
-        x = jnp.concatenate([home, jnp.zeros_like(home)])
-        return Upright(model, parts, B, linearise(field_of(whole, B), x, controls, tolerance=np.inf))
+def circle(layout: Layout) -> np.ndarray:
+    """Returns postures [n, d] in which the passive joints turn together, with the active at the goal or hanging."""
+    angle = np.linspace(-np.pi, np.pi, CIRCLE)[:, None]
+    passive = 1.0 - (layout.actuation != 0).any(axis=1)
+    rest = np.where(passive > 0, layout.goal, layout.hanging)
+    return np.concatenate([layout.goal + angle * passive, rest + angle * passive])
 
 
-def law_at(upright: Upright, joints: tuple[JointKind, ...], numbers: SwingUpNumbers, regulator: Regulator) -> Law:
-    """Returns the law x -> u of a swing-up to an equilibrium; gains, level, kick and regulator may be traced."""
-    parts, (home, _) = upright.parts, jnp.split(upright.at.x, 2)
-    # Motors are ordered by columns of the matrix, active joints by coordinates.
-    to_controls = jnp.linalg.pinv(upright.B[np.array(parts.active)])
+def _scales(model: Dynamics, layout: Layout, parts: Parts, home: Array) -> Scales:
+    """Returns the scales of a model without friction."""
+    active, passive = map(np.array, parts)
+    rest = jnp.zeros_like(home)
+    M = np.asarray(jax.jit(model.mass_matrix)(home))
+    weight = jax.jit(jax.jacfwd(lambda q: model.inverse_dynamics(q, rest, rest)))(home)
+    pull = np.asarray(weight)[np.ix_(passive, passive)]
+    stiffness = max(np.linalg.eigvals(-np.linalg.solve(M[np.ix_(passive, passive)], pull)).real)
+    fall = float(np.sqrt(max(stiffness, 0.0)))
+    energies = jax.jit(jax.vmap(lambda q: passive_energy(model, parts, home)(q, rest)))(circle(layout))
+    energy = -float(np.min(energies))
+    if not (fall > 0 and energy > 0):
+        raise InputError("the passive joints do not fall from the goal; expected a goal where they stand upright")
+    largest = np.abs(layout.limits.control).min(axis=1)
+    mobility = np.linalg.solve(M, layout.actuation)[active]
+    acceleration = float(np.min(np.abs(np.diag(mobility)) * largest))
+    coupling = float(np.linalg.norm(M[np.ix_(active, passive)]))
+    half = np.diff(layout.limits.position, axis=1)[:, 0] / 2
+    slides = np.array([kind == "prismatic" for kind in layout.joints])
+    sizes = np.where(slides, np.minimum(9.81 / fall**2, half), 1.0)
+    speed = float(np.sqrt(2 * energy / np.max(np.diag(M)[passive])))
+    return Scales(fall, energy, speed, coupling, acceleration, sizes)
+
+
+def swing_up_numbers(upright: Upright, numbers: Mapping[str, float]) -> SwingUpNumbers:
+    """Returns the settings of a swing-up from numbers without units, and perhaps "total"; raises as `lqr`."""
+    active, passive = map(np.array, upright.parts)
+    scales, largest = upright.scales, upright.forces
+    size = np.copy(scales.sizes)
+    size[active] *= numbers["reach"]
+    size[passive] = PASSIVE
+    Q = np.diag(np.concatenate([1 / size, numbers["rates"] / (size * scales.fall)]) ** 2)
+    R = np.diag(numbers["effort"] / largest**2)
+    regulator = lqr(upright.at.A, upright.at.B, Q, R)
+    K, S = map(np.asarray, regulator)
+    spare = largest - np.abs(np.asarray(upright.at.u))
+    level = float(np.min((numbers["catch"] * spare) ** 2 / np.diag(K @ np.linalg.solve(S, K.T))))
+    stiffness = numbers["stiffness"] * scales.fall
+    unit = scales.acceleration / (scales.energy * scales.coupling * scales.speed)
+    damping = 2 * numbers["damping"] * stiffness
+    gains = EnergyGains(numbers["energy"] * unit, stiffness**2, damping, numbers.get("total"))
+    kick, surplus = numbers["kick"] * float(largest.min()), numbers["surplus"] * scales.energy
+    return SwingUpNumbers(gains, Q, R, regulator, level, kick, surplus)
+
+
+def law_of(upright: Upright, numbers: SwingUpNumbers) -> Law:
+    """Returns the law x -> u of a swing-up to the equilibrium."""
+    home = upright.at.x[: len(upright.layout.joints)]
+    active, joints = np.array(upright.parts.active), upright.layout.joints
     shaped = energy_shaping(
-        without_friction(upright.model), parts, home, numbers.gains, surplus=numbers.surplus
+        without_friction(upright.model), upright.parts, home, numbers.gains, surplus=numbers.surplus
     )  # fmt: skip
-    near = regulated(regulator, upright.at.x, upright.at.u, joints)
-    cost = value(regulator, upright.at.x, joints)
 
     def far(x: Array) -> Array:
         q, qd = jnp.split(x, 2)
-        active = np.array(parts.active)
         towards = jnp.where(q[active] > home[active], -numbers.kick, numbers.kick)
-        resting = jnp.max(jnp.abs(qd)) <= numbers.still
-        return to_controls @ jnp.where(resting, towards, shaped(q, qd))
+        return upright.controls(jnp.where(jnp.max(jnp.abs(qd)) <= STILL, towards, shaped(q, qd)))
 
-    law = switched(far, near, cost, numbers.level)
-    if numbers.compensation == 0:
-        return law
-    friction = friction_compensation(
-        upright.model, parts.active, smoothing=numbers.smoothing, gain=numbers.compensation
-    )  # fmt: skip
-    return lambda x: law(x) + to_controls @ friction(*jnp.split(x, 2))
+    near = regulated(numbers.regulator, upright.at.x, upright.at.u, joints)
+    law = switched(far, near, value(numbers.regulator, upright.at.x, joints), numbers.level)
+    friction = friction_of(upright)
+    return lambda x: law(x) + friction(x)
+
+
+def friction_of(upright: Upright) -> Law:
+    """Returns x -> controls that compensate most of the friction of the active joints; zero for a model without."""
+    active, scales = np.array(upright.parts.active), upright.scales
+    with jax.ensure_compile_time_eval():  # also while a law is traced
+        moving = jnp.ones(len(upright.layout.joints))
+        present = bool(jnp.any(upright.model.friction(jnp.zeros_like(moving), moving)[active] != 0))
+    if not present:
+        return lambda x: jnp.zeros_like(upright.at.u)
+    smoothing = SMOOTHING * scales.fall * scales.sizes[active]
+    forces = friction_compensation(upright.model, upright.parts.active, smoothing=smoothing, gain=GAIN)
+    return lambda x: upright.controls(forces(*jnp.split(x, 2)))

@@ -29,7 +29,7 @@ def test_a_run_is_stored_and_comes_back(tmp_path, capsys):
 
 def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys):
     rows = {
-        "--plant unicycle": "plant 'unicycle' is unknown; choose from cart-pole, pendulum",
+        "--plant unicycle": "plant is 'unicycle'; choose from cart-pole, pendulum",
         "--method guess": "choose from fitted, residual",
         "--goal 1.2": "the limits are [2.5]",
         "--plant cart-pole --goal 0,0.5": "no equilibrium near the goal",

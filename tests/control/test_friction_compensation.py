@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 from calls import one_line
 
-from dln_jax.control.desktop_plants import desktop_cart_pole
 from dln_jax.control.tracking import friction_compensation, without_friction
 from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.friction import FrictionCoefficients
+from dln_jax.scenes.pendulums import cart_pole
+from dln_jax.scenes.scene import with_friction
 
-SCENE = desktop_cart_pole().scene
-PLANT = dynamics(SCENE.closed_form)
+NOMINAL = cart_pole(cart_mass=0.57, pole_mass=0.127, length=0.16825)
+FRICTION_LAW = FrictionCoefficients(viscous=(0.1, 1e-3), coulomb=(0.3, 5e-4), stribeck=(0.1, 2e-4))
+PLANT = dynamics(with_friction(NOMINAL, FRICTION_LAW).closed_form)
 FRICTION = jax.jit(PLANT.friction)
 
 
@@ -30,8 +33,7 @@ def test_it_does_no_work_at_rest_and_is_friction_s_share_away_from_it():
 
 
 def test_what_is_left_without_friction_is_the_frictionless_plant():
-    nominal = desktop_cart_pole()
-    bare = dynamics(nominal.nominal(**nominal.sizes).closed_form)
+    bare = dynamics(NOMINAL.closed_form)
     state = jnp.array([0.1, 2.0]), jnp.array([0.4, -3.0]), jnp.array([0.5, 0.2])
     left = without_friction(PLANT)
     np.testing.assert_allclose(jax.jit(left.inverse_dynamics)(*state), bare.inverse_dynamics(*state), rtol=1e-10)

@@ -4,15 +4,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
+from furuta import HARDWARE, SCENE, TRUTH, simulated_furuta
 
-from dln_jax.control.desktop_plants import desktop_plant, model_of_plant, simulated_plant
 from dln_jax.control.plants.exploring import Exploration, explore
 from dln_jax.data.schema import from_arrays
 from dln_jax.learning.momentum import cut_momentum_windows, window_errors
 from dln_jax.learning.recordings import driven_torques, identified, identified_chain, prepare
-
-PLANT = desktop_plant("rotary-pendulum")
-TRUTH = model_of_plant(PLANT)
 
 
 def test_torques_come_late_and_are_held():
@@ -25,7 +22,7 @@ def test_torques_come_late_and_are_held():
 
 @pytest.fixture(scope="module")
 def recording():
-    return explore(simulated_plant(PLANT), lambda _: TRUTH, Exploration(seconds=12.0)).recording
+    return explore(simulated_furuta(), lambda _: TRUTH, Exploration(seconds=12.0)).recording
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +31,7 @@ def prepared(recording):
 
 
 def test_the_delay_is_found_and_the_truth_leaves_noise_alone(prepared):
-    assert prepared.delay == PLANT.hardware.delay
+    assert prepared.delay == HARDWARE.delay
     assert len(np.unique(prepared.train.trajectory)) == 5 and len(np.unique(prepared.validation.trajectory)) == 1
     left = np.asarray(window_errors(TRUTH, cut_momentum_windows(prepared.train)))
     assert (np.sqrt(np.mean(left**2, axis=0)) < 0.02 * prepared.train.tau[:, 0].std()).all()
@@ -42,14 +39,14 @@ def test_the_delay_is_found_and_the_truth_leaves_noise_alone(prepared):
 
 @pytest.mark.slow
 def test_identified_inertias_and_friction_are_the_plant_s(prepared):
-    found = identified(prepared.train, PLANT.scene.needs).dynamics
+    found = identified(prepared.train, SCENE.needs).dynamics
     q, qd = jnp.array([0.0, 0.7]), jnp.array([2.0, 3.0])
     np.testing.assert_allclose(found.mass_matrix(q), TRUTH.mass_matrix(q), rtol=0.03)
     np.testing.assert_allclose(found.friction(q, qd), TRUTH.friction(q, qd), rtol=0.3)
 
 
 def test_the_inertias_of_an_arm_that_does_not_move_in_a_plane_take_the_higher_degree(prepared):
-    found = identified_chain(prepared, PLANT.scene.needs)
+    found = identified_chain(prepared, SCENE.needs)
     assert found.description["degree"] == [0, 2]
     q = jnp.array([0.0, 0.7])
     np.testing.assert_allclose(found.dynamics.mass_matrix(q), TRUTH.mass_matrix(q), rtol=0.03)

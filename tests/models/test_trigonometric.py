@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
+from furuta import SCENE
 
-from dln_jax.control.desktop_plants import desktop_plant
 from dln_jax.data.splits import split
 from dln_jax.learning.linear import choose_degrees, fit_linear
 from dln_jax.mechanics.equations import dynamics
@@ -133,10 +133,9 @@ def test_rank_condition_and_the_shortest_solution():
 
 def test_validation_gives_each_joint_the_degree_that_it_needs():
     """A pendulum on an arm that turns about the vertical: sin² has degree 2, and nothing depends on the yaw."""
-    scene = desktop_plant("rotary-pendulum").scene
-    data = uniform(scene, samples=400)
+    data = uniform(SCENE, samples=400)
     noise = 1e-3 * data.tau.std(axis=0)
     data = data._replace(tau=data.tau + noise * np.random.default_rng(0).normal(size=data.tau.shape))
     sets = split(data)
-    chosen, _ = choose_degrees(scene.needs, sets.train, sets.validation)
+    chosen, _ = choose_degrees(SCENE.needs, sets.train, sets.validation)
     assert chosen.candidate == (0, 2) and chosen.outcome.torque_mse == pytest.approx(noise[0] ** 2, rel=0.2)

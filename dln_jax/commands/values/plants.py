@@ -1,5 +1,6 @@
 """The plant of a value function: of a robot file, or of the run folder of a model; and uncertain plants."""
 
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control.optimal.own_plants import FILES, OwnProblem, own_problem
-from dln_jax.control.plants.mujoco_plants import mujoco_plant
+from dln_jax.control.optimal.own_plants import FOLDER, OwnProblem, own_problem
+from dln_jax.control.plants.mujoco_plants import mujoco_plant, plant_file
 from dln_jax.control.plants.plant import Layout, layout
 from dln_jax.control.plants.postures import extremes
 from dln_jax.control.state_space import Field, field_of
@@ -24,18 +25,8 @@ from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build, describe
 from dln_jax.zoo.run import Run, load
 
-OTHER_NAMES = {"furuta": "rotary-pendulum", "cartpole": "cart-pole"}
-SUFFIXES = (".xml", ".mjcf", ".urdf")
-
-
-def file_of(plant: str) -> Path:
-    """The robot file of a desktop plant with this name, or at this path."""
-    name = OTHER_NAMES.get(plant, plant)
-    if name in FILES:
-        return FILES[name]
-    if Path(plant).suffix.lower() not in SUFFIXES and not Path(plant).is_file():
-        raise InputError(f"plant '{plant}' is unknown; choose from {', '.join(FILES)}, or give the path of a file")
-    return Path(plant)
+file_of = functools.partial(plant_file, FOLDER)
+"""The file of a desktop plant by its name, or a path."""
 
 
 def of_file(path: Path, actuated: Sequence[str] = (), control: Any = None, goal: Any = None) -> tuple[Run, Layout, str]:

@@ -48,8 +48,8 @@ SLOWEST = 1e-6
 """Smallest lambda of a plant that moves, 1/s."""
 MARGIN = 1e-3
 """Margin of the action cost's range beyond the limits."""
-FILES = {path.stem: path for path in sorted((Path(__file__).parent / "mjcf").glob("*.xml"))}
-"""MJCF files of desktop plants by name."""
+FOLDER = Path(__file__).parent / "mjcf"
+"""MJCF files of desktop plants."""
 
 
 @dataclass(frozen=True)

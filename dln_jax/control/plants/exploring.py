@@ -21,11 +21,10 @@ from jaxtyping import Float
 from dln_jax.control.closed_loop import Controller
 from dln_jax.control.energy_shaping import energy_shaping
 from dln_jax.control.plants.estimators import by_differences
-from dln_jax.control.plants.planned import READY, followed, follower, plans_of
-from dln_jax.control.plants.plant import Layout, Plant, spread_of
+from dln_jax.control.plants.planned import READY, follower, plans_of, with_feedback
+from dln_jax.control.plants.plant import Layout, Plant
 from dln_jax.control.plants.runs import PlantRun, compiled, distances, run
-from dln_jax.control.plants.scales import USUAL, Scales, circle, gains_of, scales_of, swing_up_numbers
-from dln_jax.control.swing_up import Upright, upright_of
+from dln_jax.control.swing_up import USUAL, Upright, swing_up_numbers, upright_of
 from dln_jax.data.encoders.filters import low_pass
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.dynamics import Dynamics
@@ -204,55 +203,34 @@ def _fitted_law(
     seed: int,
 ) -> _Law:  # fmt: skip
     """Returns the law of a model of the runs so far, or the one before if there is no model or plan."""
-    upright = _upright(layout, fit, runs)
-    if upright is None:
+    if len(runs) < 2:
+        return before
+    try:
+        upright = upright_of(fit(recording_of(runs, layout)), layout)
+    except InputError:
         return before
     near = any((distances(one.y, layout) < NEAR).any() for one in runs)
     if before.by_plan or (may_plan and not near):
-        planned = _plan_law(layout, *upright, seed=seed)
-        if planned is not None:
-            return _Law(planned, by_plan=True)
-    return before if before.by_plan else _Law(_energy_law(layout, *upright))
+        try:
+            (plan,) = with_feedback(upright, plans_of(upright, seed=seed)[:1], [USUAL])
+            return _Law(_with_noise(follower(upright, plan), layout), by_plan=True)
+        except InputError:
+            pass
+    return before if before.by_plan else _Law(_energy_law(upright))
 
 
-def _upright(layout: Layout, fit: Callable[[Trajectories], Dynamics], runs: list[PlantRun]) -> Any:
-    """Returns a model of the runs so far with its scales, or `None` if there is none."""
-    if len(runs) < 2:
-        return None
-    lower, upper = layout.limits.control.T
-    try:
-        model = fit(recording_of(runs, layout))
-        upright = upright_of(model, layout.actuation, layout.goal, postures=circle(layout), lower=lower, upper=upper)
-        return upright, scales_of(upright, layout)
-    except InputError:
-        return None
-
-
-def _plan_law(layout: Layout, upright: Upright, scales: Scales, *, seed: int) -> Any:
-    """Returns the compiled follower of a model's least sensitive plan, or `None` if there is no plan."""
-    try:
-        plan = plans_of(upright, layout, scales, seed=seed)[0]
-        (chosen,) = followed([plan], upright, layout, scales, [USUAL], spread_of(layout))
-    except InputError:
-        return None
-    settings, _ = swing_up_numbers(upright, layout, scales, USUAL)
-    return _with_noise(follower(upright, layout, settings, chosen), layout)
-
-
-def _energy_law(layout: Layout, upright: Upright, scales: Scales) -> Any:
+def _energy_law(upright: Upright) -> Any:
     """Returns the compiled energy law of a model; the number in its memory is the surplus."""
-    lower, upper = layout.limits.control.T
-    home = jnp.split(upright.at.x, 2)[0]
-    gains, size = gains_of(scales, USUAL), layout.limits.control[:, 1]
-    to_controls = jnp.linalg.pinv(layout.actuation[np.array(upright.parts.active)])
+    layout, home = upright.layout, jnp.split(upright.at.x, 2)[0]
+    gains, size = swing_up_numbers(upright, USUAL).gains, layout.limits.control[:, 1]
     spring = _spring(layout, layout.goal)
 
     def law(surplus: Array, t: Array, x: Array) -> tuple[Array, Array]:
-        shaped = energy_shaping(upright.model, upright.parts, home, gains, surplus=surplus * scales.energy)
-        q, qd = jnp.split(x, 2)
+        wanted = surplus * upright.scales.energy
+        shaped = energy_shaping(upright.model, upright.parts, home, gains, surplus=wanted)
         # Beyond half of the reach the spring pushes back, whatever the model says.
         pull = spring(x)
-        u = jnp.clip(to_controls @ shaped(q, qd), lower, upper)
+        u = jnp.clip(upright.controls(shaped(*jnp.split(x, 2))), *layout.limits.control.T)
         return surplus, u - 2 * size * (pull - jnp.clip(pull, -1.0, 1.0))
 
     return _with_noise(Controller(None, law), layout)

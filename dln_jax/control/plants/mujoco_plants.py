@@ -16,6 +16,18 @@ from dln_jax.data.robots import Robot, compile_robot, compiled_model, joint_name
 from dln_jax.types import InputError, require_positive
 
 MOST_JOINTS = 4
+SUFFIXES = (".xml", ".mjcf", ".urdf")
+OTHER_NAMES = {"furuta": "rotary-pendulum", "cartpole": "cart-pole"}
+
+
+def plant_file(folder: Path, plant: str) -> Path:
+    """Returns the file of a folder's plant by its name, or a path; raises InputError if it is neither."""
+    names = [path.stem for path in sorted(folder.glob("*.xml"))]
+    if (name := OTHER_NAMES.get(plant, plant)) in names:
+        return folder / f"{name}.xml"
+    if Path(plant).suffix.lower() in SUFFIXES or Path(plant).is_file():
+        return Path(plant)
+    raise InputError(f"plant is {plant!r:.40}; choose from {', '.join(names)}, or give the path of a file")
 
 
 def mujoco_plant(

@@ -19,13 +19,13 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.control.closed_loop import Controller
-from dln_jax.control.plants.plant import Layout
-from dln_jax.control.plants.scales import Scales, swing_up_numbers
+from dln_jax.control.plants.plant import Layout, spread_of
 from dln_jax.control.real_time import improve
+from dln_jax.control.recovery import recovery_by_plans
 from dln_jax.control.regulators import Regulator, lqr, regulated, time_varying_lqr, value
 from dln_jax.control.state_space import Field, circular, error, field_of, integrated, linearise
-from dln_jax.control.swing_up import SwingUpNumbers, Upright
-from dln_jax.control.tracking import friction_compensation, without_friction
+from dln_jax.control.swing_up import SwingUpNumbers, Upright, friction_of, swing_up_numbers
+from dln_jax.control.tracking import without_friction
 from dln_jax.control.trajectories import Plan, TrajectoryProblem, first_plan
 from dln_jax.types import InputError
 
@@ -53,9 +53,15 @@ because it may have been lost by starting too far away. After `PATIENCE` duratio
 in case friction keeps the plant away."""
 LOST = 1.0
 """Distance of an angle from the plan or the goal, rad, beyond which the plant hangs and starts again."""
+HORIZON, COARSENESS = 6.0, 7.0
+"""Duration of repeated plans in units of 1 / lambda, and their steps per 1 / lambda."""
+MORE, LESS_AT_END, SOON = 0.9, 100.0, 1.0
+"""Their share of the motors' limits, and their weights of the errors at the end and of the distance on the way."""
+SWINGS = (0.0, 0.5, -0.5)
+"""Sizes of their first guesses, as shares of the motors' limits."""
 
 
-class Followed(NamedTuple):
+class TrackedPlan(NamedTuple):
     """A plan at the samples of a controller, with its regulators."""
 
     x: Float[Array, "N n"]
@@ -65,27 +71,18 @@ class Followed(NamedTuple):
     """Cost to go at the start."""
     level: Any
     """Cost to go from hanging below which the plan starts."""
-    goal: Regulator
+    regulator: Regulator
+    """Regulator at the goal."""
     hanging: Regulator
 
 
 def plan_problem(
-    upright: Upright,
-    layout: Layout,
-    scales: Scales,
-    effort: Any,
-    *,
-    every: int,
-    share: float = SHARE,
-    at_end: float = AT_END,
-    soon: float = 0.0,
+    upright: Upright, effort: Any, *, every: int, share: float = SHARE, at_end: float = AT_END, soon: float = 0.0
 ) -> TrajectoryProblem:
     """Returns the problem of plans to the goal.
 
     Args:
         upright: the model; friction of its driven joints is left to the compensation.
-        layout: layout of the plant.
-        scales: scales of the model.
         effort: weight of the controls; it may be traced.
         every: samples per step.
         share: largest share of the motors' limits.
@@ -93,9 +90,9 @@ def plan_problem(
         soon: weight of the distance from the goal on the way. If it is not zero, passive joints may reach the goal
             after any number of turns.
     """
-    d, size = len(layout.joints), np.abs(layout.limits.control).min(axis=1)
-    dt, goal, units = every / layout.rate, np.asarray(upright.at.x), _units(scales)
-    low, high = INSIDE * layout.limits.position.T
+    layout, size, units = upright.layout, upright.forces, _units(upright)
+    d, dt, goal = len(layout.joints), every / layout.rate, np.asarray(upright.at.x)
+    low, high = inner_ranges(layout, INSIDE)
     fastest = INSIDE * layout.limits.rate
     # Driven joints must not make extra turns, because their cables might not.
     free = circular(layout.joints, 2 * d) & np.isin(np.arange(2 * d), upright.parts.passive) & (soon > 0)
@@ -111,7 +108,7 @@ def plan_problem(
         running += POSTURE * jnp.sum(away**2)
         if soon:
             running += soon * jnp.sum(off(x)[:d] ** 2)
-        return dt * scales.fall * running + BEYOND * (
+        return dt * upright.scales.fall * running + BEYOND * (
             jnp.sum((beyond / units[:d]) ** 2) + jnp.sum((faster / units[d:]) ** 2)
         )
 
@@ -122,24 +119,23 @@ def plan_problem(
     return TrajectoryProblem(step, cost, end, lower=-share * size, upper=share * size)
 
 
-def plans_of(upright: Upright, layout: Layout, scales: Scales, *, seed: int = 0) -> list[Plan]:
+def plans_of(upright: Upright, *, seed: int = 0) -> list[Plan]:
     """Returns the plans from hanging that reach the goal, least sensitive first; raises `InputError` if none does."""
-    d, size = len(layout.joints), np.abs(layout.limits.control).min(axis=1)
-    every, goal, units = steps_of(layout, scales), np.asarray(upright.at.x), _units(scales)
-    start = np.concatenate([layout.hanging, np.zeros(d)])
+    every, size, fall = steps_of(upright), upright.forces, upright.scales.fall
+    goal, units = np.asarray(upright.at.x), _units(upright)
 
     @jax.jit
     @jax.vmap
     def solved(u: Array, effort: Array) -> Plan:
-        problem = plan_problem(upright, layout, scales, effort, every=every)
+        problem = plan_problem(upright, effort, every=every)
         again = lambda _, plan: improve(problem, plan, step_lengths=LENGTHS)  # noqa: E731
-        return jax.lax.fori_loop(0, ITERATIONS, again, first_plan(problem, start, u))
+        return jax.lax.fori_loop(0, ITERATIONS, again, first_plan(problem, upright.rest, u))
 
     random = np.random.default_rng([seed, 41])
     sizes = np.geomspace(0.03, 0.5, GUESSES)[:, None, None]
     nearest = np.inf
     for duration in DURATIONS:
-        steps = round(duration / scales.fall * layout.rate / every)
+        steps = round(duration / fall * upright.layout.rate / every)
         guesses = sizes * size * random.normal(size=(GUESSES, steps, len(size)))
         plans = jax.tree.map(np.asarray, solved(guesses, np.resize(EFFORTS, GUESSES)))
         off = np.abs((plans.x[:, -1] - goal) / units).max(axis=1)
@@ -148,42 +144,30 @@ def plans_of(upright: Upright, layout: Layout, scales: Scales, *, seed: int = 0)
             return [jax.tree.map(lambda leaf: leaf[k], plans) for k in good]  # noqa: B023
         nearest = np.nanmin([nearest, *off])
     raise InputError(
-        f"no plan of {DURATIONS[-1] / scales.fall:.3g} s leads from hanging to the goal: the best ends {nearest:.2g} "
-        "of a coordinate's size away; try a stronger motor or wider limits"
+        f"no plan of {DURATIONS[-1] / fall:.3g} s leads from hanging to the goal: the best ends {nearest:.2g} of a "
+        "coordinate's size away; try a stronger motor or wider limits"
     )
 
 
-def steps_of(layout: Layout, scales: Scales, fineness: float = FINENESS) -> int:
+def inner_ranges(layout: Layout, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the ends [d] of the middle share of every finite range of the coordinates; infinite ends stay."""
+    low, high = layout.limits.position.T
+    spare = np.where(np.isfinite(high - low), (1 - share) / 2 * (high - low), 0.0)
+    return low + spare, high - spare
+
+
+def steps_of(upright: Upright, fineness: float = FINENESS) -> int:
     """Returns the number of samples per step of a plan."""
-    return max(1, round(layout.rate / (fineness * scales.fall)))
+    return max(1, round(upright.layout.rate / (fineness * upright.scales.fall)))
 
 
-def followed(
-    chosen: Sequence[Plan],
-    upright: Upright,
-    layout: Layout,
-    scales: Scales,
-    numbers: Sequence[Mapping[str, float]],
-    spread: Any,
-) -> list[Followed]:
-    """Returns feedback about plans, from numbers without units.
-
-    Args:
-        chosen: plans from hanging, one for each set of numbers.
-        upright: the model.
-        layout: layout of the plant.
-        scales: scales of the model.
-        numbers: as for `swing_up_numbers`.
-        spread: standard deviations of the coordinates at a start [d].
-
-    Raises:
-        InputError: as for `lqr`.
-    """
-    every, d = steps_of(layout, scales), len(layout.joints)
+def with_feedback(upright: Upright, plans: Sequence[Plan], numbers: Sequence[Mapping[str, float]]) -> list[TrackedPlan]:
+    """Returns plans from hanging with their regulators, each from numbers without units; raises as `lqr`."""
+    layout, every, d = upright.layout, steps_of(upright), len(upright.layout.joints)
     step, dt = integrated(_compensated(upright), 1 / layout.rate), 1 / layout.rate
-    rest = jnp.concatenate([jnp.asarray(layout.hanging), jnp.zeros(d)])
-    field = field_of(without_friction(upright.model), upright.B)
-    below = linearise(jax.jit(field), rest, jnp.zeros(upright.B.shape[1]), tolerance=np.inf)
+    rest, spread = jnp.asarray(upright.rest), jnp.asarray(spread_of(layout))
+    field = field_of(without_friction(upright.model), layout.actuation)
+    below = linearise(jax.jit(field), rest, jnp.zeros(len(upright.forces)), tolerance=np.inf)
 
     @jax.jit
     @jax.vmap
@@ -192,31 +176,32 @@ def followed(
         x = jax.lax.scan(lambda x, u: (step(x, u), x), rest, u)[1]
         F, G = jax.vmap(jax.jacfwd(step, argnums=(0, 1)))(x, u)
         regulators = time_varying_lqr(F, G, dt * Q, dt * R, S)
-        level = 9 * jnp.sum(jnp.diagonal(regulators.S[0])[:d] * jnp.asarray(spread) ** 2)
+        level = 9 * jnp.sum(jnp.diagonal(regulators.S[0])[:d] * spread**2)
         return x, u, regulators.K, regulators.S[0], level
 
-    settings, goals = zip(*(swing_up_numbers(upright, layout, scales, one) for one in numbers), strict=True)
-    costs = [(one.state_cost, one.control_cost) for one in settings]
-    Q, R = map(np.stack, zip(*costs, strict=True))
-    rows = along(np.stack([plan.u for plan in chosen]), Q, R, np.stack([goal.S for goal in goals]))
-    x, u, K, S, level = map(np.asarray, rows)
+    settings = [swing_up_numbers(upright, one) for one in numbers]
+    Q, R, S = (
+        np.stack(rows)
+        for rows in zip(*((one.state_cost, one.control_cost, one.regulator.S) for one in settings), strict=True)
+    )
+    x, u, K, S, level = map(np.asarray, along(np.stack([plan.u for plan in plans]), Q, R, S))
     return [
-        Followed(x[k], u[k], K[k], S[k], level[k], goal, lqr(below.A, below.B, *costs[k]))
-        for k, goal in enumerate(goals)
+        TrackedPlan(x[k], u[k], K[k], S[k], level[k], one.regulator, lqr(below.A, below.B, Q[k], R[k]))
+        for k, one in enumerate(settings)
     ]
 
 
-def follower(upright: Upright, layout: Layout, settings: SwingUpNumbers, plan: Followed) -> Controller:
+def follower(upright: Upright, plan: TrackedPlan) -> Controller:
     """Returns the controller of states x that swings up by a plan, whose arrays may be traced."""
-    joints, angles = layout.joints, np.array([kind == "revolute" for kind in layout.joints])
+    joints, last = upright.layout.joints, len(plan.u)
+    angles = np.array([kind == "revolute" for kind in joints])
     plan = jax.tree.map(jnp.asarray, plan)
-    rest = jnp.concatenate([jnp.asarray(layout.hanging), jnp.zeros(len(joints))])
-    hold, wait = regulated(plan.goal, upright.at.x, upright.at.u, joints), regulated(plan.hanging, rest, 0.0, joints)
-    begins, last = value(Regulator(plan.K[0], plan.S), rest, joints), len(plan.u)
-    to_controls = jnp.linalg.pinv(upright.B[np.array(upright.parts.active)])
-    friction = friction_compensation(
-        upright.model, upright.parts.active, smoothing=settings.smoothing, gain=settings.compensation
-    )  # fmt: skip
+    rest, friction = jnp.asarray(upright.rest), friction_of(upright)
+    hold, wait = (
+        regulated(plan.regulator, upright.at.x, upright.at.u, joints),
+        regulated(plan.hanging, rest, 0.0, joints),
+    )
+    begins = value(Regulator(plan.K[0], plan.S), rest, joints)
 
     def act(number: Array, t: Array, x: Array) -> tuple[Array, Array]:
         level = plan.level * jnp.where(number < READY, CALM, 1.0)
@@ -226,25 +211,47 @@ def follower(upright: Upright, layout: Layout, settings: SwingUpNumbers, plan: F
         lost = jnp.max(jnp.abs(off[: len(joints)])[angles]) > LOST
         number = jnp.where(lost & (number >= 0), READY - PATIENCE * last, number)
         u = jnp.where(number < last, plan.u[k] - plan.K[k] @ off, hold(x))
-        u = jnp.where(number < 0, wait(x), u)
-        if settings.compensation:
-            u = u + to_controls @ friction(*jnp.split(x, 2))
+        u = jnp.where(number < 0, wait(x), u) + friction(x)
         return jnp.where(number == READY, number, jnp.minimum(number + 1, last)), u
 
     return Controller(jnp.asarray(READY), act)
 
 
-def _units(scales: Scales) -> np.ndarray:
-    return np.concatenate([scales.sizes, scales.sizes * scales.fall])
+def by_repeated_plans(upright: Upright, numbers: SwingUpNumbers) -> Controller:
+    """Returns the controller of states x by repeated plans (`recovery_by_plans`) and the numbers' regulator and level.
+
+    Plans have a cost of the distance from the goal on the way, so that they do not put it off, and any number of turns
+    of the passive joints. They start from three first guesses: no control, and swings that begin to either side.
+    """
+    layout, fall, every = upright.layout, upright.scales.fall, steps_of(upright, COARSENESS)
+    dt, joints, friction = every / layout.rate, layout.joints, friction_of(upright)
+    problem = plan_problem(upright, EFFORTS[1], every=every, share=MORE, at_end=LESS_AT_END, soon=SOON)
+    t = dt * np.arange(round(HORIZON / fall / dt))
+    swings = np.array(SWINGS)[:, None, None] * np.sin(fall * t)[:, None] * upright.forces
+    plans = jax.vmap(lambda u: first_plan(problem, jnp.asarray(upright.rest), u))(swings)
+    near = regulated(numbers.regulator, upright.at.x, upright.at.u, joints)
+    cost = value(numbers.regulator, upright.at.x, joints)
+    law = recovery_by_plans(problem, plans, near, cost, numbers.level, rate=layout.rate, every=every)
+
+    def act(memory: Any, t: Array, x: Array) -> tuple[Any, Array]:
+        memory, u = law.act(memory, t, x)
+        return memory, u + friction(x)
+
+    return Controller(law.start, act)
+
+
+def _units(upright: Upright) -> np.ndarray:
+    return np.concatenate([upright.scales.sizes, upright.scales.sizes * upright.scales.fall])
 
 
 def _compensated(upright: Upright) -> Field:
     """Returns the field of a plant with friction at the passive joints only; that of the others is compensated."""
-    driven = (upright.B != 0).any(axis=1)
+    B = upright.layout.actuation
+    driven = (B != 0).any(axis=1)
 
     def field(x: Array, u: Array) -> Array:
         q, qd = jnp.split(x, 2)
-        tau = upright.B @ u + jnp.where(driven, upright.model.friction(q, qd), 0.0)
+        tau = B @ u + jnp.where(driven, upright.model.friction(q, qd), 0.0)
         return jnp.concatenate([qd, upright.model.forward_dynamics(q, qd, tau)])
 
     return field

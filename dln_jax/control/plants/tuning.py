@@ -1,6 +1,6 @@
 """Chooses a swing-up's gains, catch region and regulator by simulated trials of a model, in one compiled program.
 
-1. Numbers without units (`scales.RANGES`) are drawn; scales of the model turn them into gains and a regulator.
+1. Numbers without units (`swing_up.RANGES`) are drawn; scales of the model turn them into gains and a regulator.
 2. Every set is tried from near hanging, with the hardware's limits, resolution, noise and delay, and with motors that
    are stronger or weaker than the model says. The weight is wrong by the share `WEIGHT` of that, in the opposite
    direction; stronger motors also act later, by the share `LATE` of a sample.
@@ -21,16 +21,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control.closed_loop import Controller, Hardware, simulate
+from dln_jax.control.closed_loop import Controller, Hardware, simulate, stateless
 from dln_jax.control.plants.estimators import Estimator, by_differences
-from dln_jax.control.plants.guarded import SPAN
+from dln_jax.control.plants.planned import (
+    TrackedPlan,
+    by_repeated_plans,
+    follower,
+    inner_ranges,
+    plans_of,
+    with_feedback,
+)
 from dln_jax.control.plants.plant import Layout, spread_of
-from dln_jax.control.plants.runs import HELD, TOLERANCE
-from dln_jax.control.plants.scales import circle, scales_of
-from dln_jax.control.plants.ways import RECOVERIES, Way, require_recovery
-from dln_jax.control.regulators import Regulator
+from dln_jax.control.plants.runs import HELD, SPAN, TOLERANCE
 from dln_jax.control.state_space import error
-from dln_jax.control.swing_up import upright_of
+from dln_jax.control.swing_up import RANGES, SwingUpNumbers, Upright, law_of, swing_up_numbers, upright_of
 from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.types import InputError, require_positive, require_seed
 
@@ -58,19 +62,21 @@ SECONDS, FALLS = 6.0, 26.0
 """Duration of a trial, s, and the least one in units of 1 / lambda: the longest plan, with time to come to rest."""
 LEAST = 0.1
 """Smallest margin of an energy law that is taken in place of a plan."""
+PLANS = 8
+"""Largest number of plans that are tried with feedback."""
+SETS_OF_REPEATED_PLANS = 2
+"""Few, because trials of repeated plans take far longer than others: each of them plans at every step of a plan."""
 
 
-class Tuned(NamedTuple):
+class SwingUp(NamedTuple):
     """A controller that swings the model up, and how safely."""
 
     controller: Controller
     """Controller of the measurements."""
     way: str
     """"energy", "plan" or "repeated plans"."""
-    numbers: Mapping[str, float]
-    """Chosen settings, in SI units."""
-    regulator: Regulator
-    """Regulator at the goal."""
+    settings: SwingUpNumbers | TrackedPlan
+    """Chosen settings, in SI units, with the regulator at the goal."""
     trials: int
     """Number of simulated trials."""
     worked: float
@@ -89,11 +95,10 @@ def tune(
     estimator: Estimator | None = None,
     sets: int = 64,
     seconds: float | None = None,
-    substeps: int = 1,
     late: float = 0.0,
     seed: int = 0,
     recover: str = "swing-up",
-) -> Tuned:
+) -> SwingUp:
     """Chooses all settings of a swing-up by trials.
 
     Args:
@@ -104,7 +109,6 @@ def tune(
         sets: number of sets in a first round.
         seconds: duration of a trial, within which a plant must come up and stay for a second; by default 6 s, or longer
             for large plants, which fall slowly.
-        substeps: Runge-Kutta steps per sample.
         late: share of a sample by which motors act later than the hardware's whole number of samples.
         seed: seed of the sets, the starts and the noise.
         recover: "plans" for a law that plans again from where a push leaves the plant, or "swing-up".
@@ -112,22 +116,20 @@ def tune(
     Raises:
         InputError: `swing_up` refuses the model, no set swings it up, or the recovery is unknown.
     """
-    require_positive(sets=sets, substeps=substeps)
+    require_positive(sets=sets)
     require_seed(seed)
     if seconds is not None and not seconds > HELD:
         raise InputError(f"seconds is {seconds}; expected more than the {HELD:g} s for which a plant has to stay up")
     require_recovery(recover)
-    lower, upper = layout.limits.control.T
-    upright = upright_of(model, layout.actuation, layout.goal, postures=circle(layout), lower=lower, upper=upper)
-    scales, estimator = scales_of(upright, layout), estimator or by_differences(layout)
-    seconds = max(SECONDS, FALLS / scales.fall) if seconds is None else seconds
+    upright, estimator = upright_of(model, layout), estimator or by_differences(layout)
+    seconds = max(SECONDS, FALLS / upright.scales.fall) if seconds is None else seconds
     results, refused = [], []
     for make in RECOVERIES[recover]:
         try:
-            way = make(upright, layout, scales, seed)
+            way = make(upright, seed)
             trial = trial_of(
                 lambda settings, way=way: estimator(way.controller(settings)), upright.model, layout, hardware,
-                seconds=seconds, substeps=substeps, late=late,
+                seconds=seconds, late=late,
             )  # fmt: skip
             results.append(_chosen(way, trial, estimator, layout, sets=sets, seconds=seconds, seed=seed))
         except InputError as error:
@@ -140,9 +142,66 @@ def tune(
     return best._replace(trials=sum(one.trials for one in results))
 
 
+class Way(NamedTuple):
+    """A way of swinging up, with settings chosen by trials."""
+
+    name: str
+    draw: Callable[[np.random.Generator, int], list[Any]]
+    """(random, count) -> settings, trees of arrays of equal shapes."""
+    controller: Callable[[Any], Controller]
+    """Settings, perhaps traced -> controller of states."""
+    errors: tuple[float, ...]
+    """Errors in the first round, one trial each."""
+    most_sets: int | None = None
+    """Largest number of sets in a round; by default as many as are asked for."""
+
+
+def _by_energy(upright: Upright, seed: int) -> Way:
+    """Returns the way by energy laws and a regulator."""
+    draw = lambda random, count: [swing_up_numbers(upright, one) for one in _draws(random, count)]  # noqa: E731
+    return Way("energy", draw, lambda one: stateless(law_of(upright, one)), (0.0, 0.0))
+
+
+def _by_plan(upright: Upright, seed: int) -> Way:
+    """Returns the way by plans with feedback; raises as `plans_of`."""
+    plans = plans_of(upright, seed=seed)[:PLANS]
+
+    def draw(random: np.random.Generator, count: int) -> list[Any]:
+        return with_feedback(upright, [plans[k % len(plans)] for k in range(count)], _draws(random, count))
+
+    return Way("plan", draw, lambda plan: follower(upright, plan), (0.15, -0.15))
+
+
+def _by_repeated_plans(upright: Upright, seed: int) -> Way:
+    """Returns the way by repeated plans, which also recover from pushes, and a regulator."""
+    draw = _by_energy(upright, seed).draw
+    controller = lambda one: by_repeated_plans(upright, one)  # noqa: E731
+    return Way("repeated plans", draw, controller, (0.15, -0.15), SETS_OF_REPEATED_PLANS)
+
+
+RECOVERIES: Mapping[str, tuple[Callable[[Upright, int], Way], ...]] = {
+    "swing-up": (_by_plan, _by_energy),
+    "plans": (_by_repeated_plans,),
+}
+"""Ways that are tried, by how the plant comes up again after a push: as from hanging, or by plans from where it is."""
+
+
+def require_recovery(name: str) -> None:
+    """Raises `InputError` for a name that is not one of `RECOVERIES`."""
+    if name not in RECOVERIES:
+        raise InputError(f"recover is {name!r:.40}; choose from {', '.join(RECOVERIES)}")
+
+
+def _draws(random: np.random.Generator, count: int) -> list[dict[str, float]]:
+    """Returns sets of numbers, alternately with the energy of the passive part and of the whole plant."""
+    low, high = np.log(np.array(list(RANGES.values()))).T
+    rows = np.exp(random.uniform(low, high, size=(count, len(RANGES))))
+    return [{**dict(zip(RANGES, row, strict=True)), "total": float(k % 2)} for k, row in enumerate(rows)]
+
+
 def _chosen(
     way: Way, trial: Any, estimator: Estimator, layout: Layout, *, sets: int, seconds: float, seed: int
-) -> Tuned:  # fmt: skip
+) -> SwingUp:  # fmt: skip
     """Returns the settings of one way with the largest margin."""
     random = np.random.default_rng([seed, 31])
     sets = min(sets, way.most_sets or sets)
@@ -156,7 +215,7 @@ def _chosen(
     def tried(chosen: list[Any], errors: tuple[float, ...], starts: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns times and changes of the controls [set, error, start]; idle lanes repeat the first trials."""
         nonlocal trials
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *chosen)
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves).astype(float), *chosen)
         count = len(chosen) * len(errors) * starts
         place = np.arange(lanes) % count
         which, error_of, start_of = np.unravel_index(place, (len(chosen), len(errors), starts))
@@ -200,10 +259,9 @@ def _chosen(
             "wider limits"
         )
     selected = jax.tree.map(jnp.asarray, settings[best[choice]])
-    numbers, regulator = way.numbers(selected)
-    return Tuned(
-        estimator(way.controller(selected)), way.name, numbers, regulator, trials, float(good.mean()),
-        float(margins[choice]), float(nominal[choice]),
+    return SwingUp(
+        estimator(way.controller(selected)), way.name, selected, trials, float(good.mean()), float(margins[choice]),
+        float(nominal[choice]),
     )  # fmt: skip
 
 
@@ -214,7 +272,6 @@ def trial_of(
     hardware: Hardware,
     *,
     seconds: float,
-    substeps: int,
     late: float,
 ) -> Callable[[Any, Array, Array, Array], tuple[Array, Array]]:
     """Returns (traced settings, start [d], error of the model, key) -> (seconds, changes).
@@ -226,9 +283,7 @@ def trial_of(
     lower, upper = layout.limits.control.T
     limited = hardware._replace(lower=lower, upper=upper, sees_rates=False)
     angles = np.array([kind == "revolute" for kind in layout.joints])
-    low, high = layout.limits.position.T
-    spare = np.where(np.isfinite(high - low), (1 - RESERVE) / 2 * (high - low), 0.0)
-    low, high = low + spare, high - spare
+    low, high = inner_ranges(layout, RESERVE)
     has_limits = np.isfinite(layout.limits.position).any() or np.isfinite(layout.limits.rate).any()
 
     def within(q: Array, qd: Array) -> Array:
@@ -246,7 +301,7 @@ def trial_of(
         later = _late(controller(settings), jnp.minimum(late + LATE * (wrong > 0), 1.0), lower, upper)
         run = simulate(
             field, later, jnp.concatenate([start, jnp.zeros(d)]), seconds=seconds, rate=layout.rate,
-            controls=B.shape[1], hardware=limited, key=key, substeps=substeps,
+            controls=B.shape[1], hardware=limited, key=key,
         )  # fmt: skip
         off = jax.vmap(lambda x: error(x[:d], layout.goal, layout.joints))(run.x)
         away = ~(jnp.max(jnp.abs(off[:, angles]), axis=1) <= WITHIN * TOLERANCE)  # NaN is away

@@ -210,6 +210,6 @@ def _write(directory: Path, files: Mapping[str, bytes], overwrite: bool) -> list
         raise InputError(f"{directory}: cannot write there ({error.strerror}); choose another folder") from error
     with ExitStack() as stack:
         # All files are complete before the first is renamed; the stack renames in reverse order.
-        for name in reversed(files):
+        for name in reversed(list(files)):
             stack.enter_context(writing(directory / name)).write_bytes(files[name])
     return [directory / name for name in files]

@@ -15,13 +15,13 @@ import numpy as np
 
 from dln_jax import joint_dissipation, tree_system
 from dln_jax.control.closed_loop import Hardware, following, outcomes
-from dln_jax.control.desktop_plants import desktop_plant, law_of, nominal_model
 from dln_jax.control.observers import with_differences
 from dln_jax.control.optimal.problem import hjb_policy
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.control.plants.mujoco_plants import simulate_in_mujoco
 from dln_jax.control.regulators import regulated
 from dln_jax.control.state_space import field_of, integrated
+from dln_jax.control.swing_up import USUAL, law_of, swing_up_numbers, upright_of
 from dln_jax.control.tracking import Gains, Reference, computed_torque, feed_forward, feedback, judged, trusted
 from dln_jax.control.trajectories import TrajectoryProblem, first_plan
 from dln_jax.data.encoders.smoothing import smooth
@@ -44,6 +44,7 @@ from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.control import plans
 from scripts.reports.control.problems import Sizes, in_jax
 from scripts.reports.control.published import cart_pole_on_rail
+from scripts.reports.control.swing_ups import desk, model_of
 from scripts.reports.robots.arm import DAMPING, MIDDLE, STEP, STIFFNESS, D, Motion, arm, logs, measured, motion
 from scripts.reports.run import Numbers
 from scripts.reports.speed.exported_c import compiled, evicting, programs, random_network, timed
@@ -145,13 +146,14 @@ def tracking(
 
 def laws_in_c(*, repeats: int = 9, calls: int = 1000, cold: int = 1000) -> Numbers:
     """Times of a call of laws as C: medians of warm calls, and quantiles of cold ones after reading 32 MiB or more."""
-    desk, problem = desktop_plant("rotary-pendulum"), cart_pole_on_rail().problem
-    swing_up, joints = law_of(desk, nominal_model(desk)), desk.scene.needs.joints
+    problem, layout = cart_pole_on_rail().problem, desk("furuta").layout
+    upright = upright_of(model_of("furuta", "analytic"), layout)
+    numbers = swing_up_numbers(upright, USUAL)
     tree, network = dynamics(tree_system(arm(coulomb=False).tree)), value_network(problem, widths=(64, 64), scale=30.0)
     parameters = network.init(jax.random.key(0))
     of_states = {
-        "regulator": regulated(swing_up.regulator, swing_up.equilibrium, swing_up.controls, joints),
-        "swing_up": swing_up.law,
+        "regulator": regulated(numbers.regulator, upright.at.x, upright.at.u, layout.joints),
+        "swing_up": law_of(upright, numbers),
         "value_policy": hjb_policy(lambda x: network.value_and_gradient(parameters, x), problem),
     }
     trackers = {

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.commands.swing_ups.learning import SECONDS, Learned, learn_to_swing_up, try_plant
+from dln_jax.commands.learned_plants import SECONDS, Learned, learn_to_swing_up, try_plant
 from dln_jax.control.closed_loop import Hardware
 from dln_jax.control.plants.mujoco_plants import mujoco_plant
 from dln_jax.control.plants.outside_loops import gymnasium_plant, hardware_plant
@@ -239,7 +239,7 @@ def swing_up(*, plant: str, sizes: int, starts: int = 100) -> Numbers:
     except InputError as refusal:
         print(refusal, flush=True)
         return {case: {"success_share": 0.0}}
-    return {case: success(try_plant(make, learned.tuned, starts=starts)[0], learned)}
+    return {case: success(try_plant(make, learned.law, starts=starts)[0], learned)}
 
 
 def success(trials: Trials, learned: Learned) -> dict[str, float]:
@@ -249,7 +249,7 @@ def success(trials: Trials, learned: Learned) -> dict[str, float]:
         "seconds_median": np.median(trials.seconds[trials.up]) if trials.up.any() else np.inf,
         "stopped": len(trials.stopped),
         "delay": learned.prepared.delay,
-        "tuning_margin": learned.tuned.margin,
+        "tuning_margin": learned.law.margin,
         "learning_seconds": learned.seconds,
     }
 
@@ -262,6 +262,6 @@ def late_samples(*, milliseconds: int, starts: int = 20) -> Numbers:
     settings = {"reset": late.reset, "read": late.read, "write": late.write, "sleep": late.sleep}
     plant = hardware_plant(described, **settings, clock=lambda: late.now)
     learned = learn_to_swing_up(plant, seed=0)
-    act, memory = compiled(learned.tuned.controller, plant.layout), start_of(learned.tuned.controller, 1)
+    act, memory = compiled(learned.law.controller, plant.layout), start_of(learned.law.controller, 1)
     runs = [run([plant], act, memory, seconds=SECONDS)[0] for _ in range(starts)]
     return {f"rig/late-by-{milliseconds}-ms": success(judged_runs(runs, plant.layout, seconds=SECONDS), learned)}

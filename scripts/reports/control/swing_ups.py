@@ -5,6 +5,7 @@ The poles have dry friction, encoders as their only sensors, noise and a sample 
 chosen by its score, since the plant is known.
 """
 
+import functools
 import itertools
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
@@ -13,35 +14,33 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.commands.swing_ups.learning import errors_along, obtain, recorded, test_motions
-from dln_jax.control.closed_loop import (
-    ClosedLoopRun,
-    Controller,
-    Hardware,
-    Outcomes,
-    hanging_starts,
-    outcomes,
-    simulate,
-)
-from dln_jax.control.desktop_plants import (
-    SECONDS,
-    desktop_plant,
-    law_of,
-    model_of_plant,
-    motion_of,
-    try_starts,
-)
+from dln_jax.commands.learned_plants import SECONDS, file_of, fit_of, learn_to_swing_up, try_plant
+from dln_jax.commands.learned_plants import model_of as identified_model
+from dln_jax.control.closed_loop import ClosedLoopRun, Controller, Hardware, hanging_starts, outcomes, simulate
 from dln_jax.control.estimate.tuning import from_log
 from dln_jax.control.plants.estimators import by_differences, by_filter
+from dln_jax.control.plants.exploring import Exploration, explore
+from dln_jax.control.plants.mujoco_plants import mujoco_plant
+from dln_jax.control.plants.plant import Plant
+from dln_jax.control.plants.tuning import tune
 from dln_jax.control.regulators import sampled_lqr
 from dln_jax.control.shooting import shoot
 from dln_jax.control.state_space import error, field_of, integrated, linearise, saturated
+from dln_jax.control.swing_up import USUAL, law_of, swing_up_numbers, upright_of
 from dln_jax.control.trajectories import Plan, TrajectoryProblem
+from dln_jax.data.schema import Trajectories
+from dln_jax.learning.recordings import FittedPlant, PreparedRecording, prepare
+from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.pendulums import Links, two_link_pendulum
 from dln_jax.types import InputError
 from scripts.reports.run import Numbers
 
+TURN = 2 * np.pi / 2048
+STEPS = {"cart-pole": np.array([2.3e-5, TURN]), "furuta": np.array([TURN, TURN])}
+"""Resolutions of the encoders, m and rad."""
+NOISE = 0.005
+"""Standard deviation of the motors' noise, as a share of their limits."""
 RATE, LIMIT = 500.0, 6.0
 """Sampling rate of the board, Hz, and its torque limit, N m."""
 HEIGHT = 0.9
@@ -54,17 +53,89 @@ EVERY = 10
 Motor = Literal["elbow", "shoulder"]
 
 
-def known_models(*, plant: str, anywhere: bool = False, starts: int = 1000) -> Numbers:
-    """Starts near hanging, or over the pole's phase plane, that are up after ten seconds, by the plant's own model."""
-    desk = desktop_plant(plant)
-    x = hanging_starts(starts, 0, position=desk.position)
-    if anywhere:
-        random, x = np.random.default_rng(1), np.zeros((starts, 4))
-        x[:, 1], x[:, 3] = random.uniform(-np.pi, np.pi, starts), random.uniform(-15.0, 15.0, starts)
-    motion = motion_of(desk, model_of_plant(desk))
-    run = jax.jit(jax.vmap(lambda x, key: motion(x, key).x[:, :2]))
+def desk(plant: str, *, seed: int = 0) -> Plant:
+    """A desktop plant of the library."""
+    noise = NOISE * mujoco_plant(file_of(plant)).layout.limits.control[:, 1]
+    hardware = Hardware(encoder_step=STEPS[plant], control_noise=noise, delay=1)
+    return mujoco_plant(file_of(plant), hardware=hardware, seed=seed)
+
+
+def model_of(plant: str, name: str, prepared: PreparedRecording | None = None) -> Dynamics:
+    """A model of a desktop plant by its name, from a recording or from its file."""
+    return fit_of(name, file_of(plant), desk(plant).layout)(prepared).dynamics  # type: ignore[arg-type]
+
+
+def recorded(plant: str, *, seed: int, settings: Exploration = Exploration()) -> Trajectories:  # noqa: B008
+    """An exploration of a desktop plant of 30 s."""
+    made = desk(plant, seed=seed)
+
+    return explore(made, identified_model, settings, seed=seed).recording
+
+
+def by_model(*, plant: str, model: str, seeds: int = 3, starts: int = 100) -> Numbers:
+    """Swing-ups by models of several recordings of 30 s, each with starts of its own, and errors on unseen motions."""
+    tries, errors, spent = [], [], []
+    truth = model_of(plant, "known")
+    for seed in range(seeds):
+        fit = fit_of(model, file_of(plant), desk(plant).layout, seed)
+        try:
+            found = learn_to_swing_up(desk(plant, seed=seed), fit=fit, seed=seed)
+        except InputError as refusal:  # all starts fail
+            print(refusal, flush=True)
+            tries.append(np.full(starts, np.inf))
+            continue
+        spent.append(found.seconds)
+        tries.append(try_plant(functools.partial(desk, plant), found.law, starts=starts)[0].seconds)
+        blind = Exploration(seconds=12.0, blind=(0.4, 0.8), surplus=())
+        errors.append(errors_at(truth, found.fitted, recorded(plant, seed=500 + seed, settings=blind)))
+    up = [seconds[np.isfinite(seconds)] for seconds in tries]
+    numbers = {
+        "success_share": min(np.isfinite(seconds).mean() for seconds in tries),
+        "seconds_median": np.median(np.concatenate(up)),
+        "seconds_worst": max(np.max(seconds, initial=0.0) for seconds in up),
+        "learning_seconds_median": np.median(spent),
+    }
+    for name, values in zip(("torque", "acceleration"), np.array(errors).T, strict=True):
+        numbers |= {f"{name}_nmse_median": np.median(values), f"{name}_nmse_worst": values.max()}
+    return {f"{'swing-up' if model == 'known' else 'learned'}/{plant}/{model}": numbers}
+
+
+def errors_at(truth: Dynamics, fitted: FittedPlant, motions: Trajectories) -> tuple[float, float]:
+    """Normalised errors of a model's torques and accelerations at the states of a recording.
+
+    They are sums of squared errors over sums of squares of the truth.
+    """
+    data, model = prepare(motions, chain=True).train, fitted.dynamics
+
+    def squares(q, qd, qdd, tau):
+        torque, acceleration = truth.inverse_dynamics(q, qd, qdd), truth.forward_dynamics(q, qd, tau)
+        off = model.inverse_dynamics(q, qd, qdd) - torque, model.forward_dynamics(q, qd, tau) - acceleration
+        return tuple(jnp.sum(array**2) for array in (*off, torque, acceleration))
+
+    sums = [float(np.sum(part)) for part in jax.jit(jax.vmap(squares))(data.q, data.qd, data.qdd, data.tau)]
+    return sums[0] / sums[2], sums[1] / sums[3]
+
+
+def anywhere(*, plant: str, starts: int = 1000) -> Numbers:
+    """Starts over the pole's phase plane that are up after ten seconds; the plant's own model simulates it."""
+    truth, made = model_of(plant, "known"), desk(plant)
+    lower, upper = made.layout.limits.control.T
+    noise = Hardware(lower, upper, STEPS[plant], 0.0, NOISE * upper, 1, sees_rates=False)
+    law = tune(truth, made.layout, noise).controller
+    random, x = np.random.default_rng(1), np.zeros((starts, 4))
+    x[:, 1], x[:, 3] = random.uniform(-np.pi, np.pi, starts), random.uniform(-15.0, 15.0, starts)
+    field, rate = field_of(truth, made.layout.actuation), made.layout.rate
+
+    @jax.jit
+    @jax.vmap
+    def run(x, key):
+        found = simulate(
+            field, law, x, seconds=SECONDS, rate=rate, controls=1, hardware=noise, key=key, substeps=2
+        )  # fmt: skip
+        return found.x[:, :2]
+
     q = np.asarray(run(x, jax.random.split(jax.random.key(0), starts)))
-    result = outcomes(q[..., 1], rate=desk.rate)
+    result = outcomes(q[..., 1], rate=rate)
     numbers = {
         "success_share": result.share,
         "no_number": float(result.failed.sum()),
@@ -72,31 +143,7 @@ def known_models(*, plant: str, anywhere: bool = False, starts: int = 1000) -> N
         "seconds_worst": result.worst,
         "farthest": np.abs(q[..., 0]).max(),
     }
-    return {f"{'starts' if anywhere else 'swing-up'}/{plant}/known": numbers}
-
-
-def learned(*, plant: str, model: str, seeds: int = 3, starts: int = 1000) -> Numbers:
-    """Swing-ups by models of several recordings of 30 s, each with starts of its own, and errors on unseen motions."""
-    desk, tries, errors, spent = desktop_plant(plant), [], [], []
-    for seed in range(seeds):
-        obtained = obtain(desk, model, recorded(desk, seconds=30.0, seed=seed), seed=seed)
-        spent.append(obtained.seconds)
-        errors.append(errors_along(desk, obtained.dynamics, test_motions(desk, seed=seed)))
-        try:
-            # The gains were chosen on other starts.
-            tries.append(try_starts(desk, obtained.dynamics, starts=starts, seed=seed + 100).outcomes)
-        except InputError:  # the controller rejects the model: all starts fail
-            tries.append(Outcomes(np.full(starts, np.inf), np.zeros(starts, bool)))
-    numbers = {
-        "success_share": min(one.share for one in tries),
-        "not_finite_share": max(np.mean(one.failed) for one in tries),
-        "seconds_median": np.median([one.median for one in tries]),
-        "seconds_worst": max(one.worst for one in tries),
-        "learning_seconds_median": np.median(spent),
-    }
-    for name, values in zip(("torque", "acceleration"), np.array(errors).T, strict=True):
-        numbers |= {f"{name}_nmse_median": np.median(values), f"{name}_nmse_worst": values.max()}
-    return {f"learned/{plant}/{model}": numbers}
+    return {f"starts/{plant}/known": numbers}
 
 
 def estimates(*, plant: str, model: str, starts: int = 100) -> Numbers:
@@ -104,13 +151,15 @@ def estimates(*, plant: str, model: str, starts: int = 100) -> Numbers:
 
     The exact state is that of the time when a control acts.
     """
-    desk, measured, differences = desktop_plant(plant), {}, np.nan
-    recording, layout, delay = recorded(desk, seconds=30.0, seed=0), desk.layout, desk.hardware.delay
-    lower, upper, last = desk.hardware.lower, desk.hardware.upper, round(2.0 * desk.rate)
-    system = obtain(desk, model, recording, seed=0).dynamics
-    process = from_log(system, recording, actuation=layout.actuation, delay=delay)
-    law, field = law_of(desk, system).law, field_of(model_of_plant(desk), layout.actuation)
-    step = integrated(field, 1 / desk.rate, substeps=desk.substeps)
+    measured, differences = {}, np.nan
+    truth, layout, recording = model_of(plant, "known"), desk(plant).layout, recorded(plant, seed=0)
+    lower, upper = layout.limits.control.T
+    hardware = Hardware(lower, upper, STEPS[plant], 0.0, NOISE * upper, 1, sees_rates=False)
+    last, field = round(2.0 * layout.rate), field_of(truth, layout.actuation)
+    system = model_of(plant, model, prepare(recording, chain=True))
+    process = from_log(system, recording, actuation=layout.actuation, delay=1)
+    upright = upright_of(system, layout)
+    law, step = law_of(upright, swing_up_numbers(upright, USUAL)), integrated(field, 1 / layout.rate, substeps=2)
 
     def foreseeing(law):
         def act(u, t, x):
@@ -120,7 +169,7 @@ def estimates(*, plant: str, model: str, starts: int = 100) -> Numbers:
         return Controller(jnp.zeros(1), act)
 
     def trial(controller, hardware):
-        settings: Any = {"rate": desk.rate, "substeps": desk.substeps, "controls": 1, "hardware": hardware}
+        settings: Any = {"rate": layout.rate, "substeps": 2, "controls": 1, "hardware": hardware}
 
         def one(x, key):
             run = simulate(field, controller, x, seconds=SECONDS, key=key, **settings)
@@ -134,18 +183,18 @@ def estimates(*, plant: str, model: str, starts: int = 100) -> Numbers:
 
     estimators: dict[str, Callable[..., Controller]] = {
         "differences": by_differences(layout),
-        "extended": by_filter(layout, process, delay=delay),
-        "unscented": by_filter(layout, process._replace(unscented=True), delay=delay),
+        "extended": by_filter(layout, process, delay=1),
+        "unscented": by_filter(layout, process._replace(unscented=True), delay=1),
         "exact-state": foreseeing,
     }
-    x, keys = hanging_starts(starts, 0, position=desk.position), jax.random.split(jax.random.key(0), starts)
+    x, keys = hanging_starts(starts, 0, position=0.02), jax.random.split(jax.random.key(0), starts)
     for name, estimator in estimators.items():
         seen = {"encoder_step": 0.0, "sees_rates": True} if name == "exact-state" else {}
-        angle, *of_torque = trial(estimator(law), desk.hardware._replace(**seen))(x, keys)
+        angle, *of_torque = trial(estimator(law), hardware._replace(**seen))(x, keys)
         rms, change, flips = (float(np.median(values)) for values in of_torque)
         differences = rms if name == "differences" else differences
         measured[f"estimates/{plant}/{model}/{name}"] = {
-            "success_share": outcomes(angle, rate=desk.rate).share,
+            "success_share": outcomes(angle, rate=layout.rate).share,
             "torque_rms": rms,
             "torque_rms_ratio": rms / differences,
             "torque_change_rms": change,

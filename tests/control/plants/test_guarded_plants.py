@@ -8,10 +8,9 @@ from calls import one_line
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.control.closed_loop import Controller, Push
-from dln_jax.control.plants.guarded import Stopped, guarded
 from dln_jax.control.plants.outside_loops import hardware_plant
 from dln_jax.control.plants.plant import Plant, layout
-from dln_jax.control.plants.runs import PlantRun, compiled, judged_runs, run, start_of
+from dln_jax.control.plants.runs import PlantRun, Stopped, compiled, guarded, judged_runs, run, start_of
 
 
 def described(actuated=(0,), **changed):

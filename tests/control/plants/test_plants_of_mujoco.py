@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax import tree_system
 from dln_jax.control.closed_loop import Hardware
-from dln_jax.control.plants.guarded import guarded
 from dln_jax.control.plants.mujoco_plants import mujoco_plant
+from dln_jax.control.plants.runs import guarded
 from dln_jax.control.state_space import field_of, integrated
 from dln_jax.data.robots import read_robot
 from dln_jax.mechanics.equations import dynamics

@@ -9,13 +9,12 @@ from numpy.testing import assert_allclose
 
 from dln_jax.control.closed_loop import Hardware, simulate, stateless
 from dln_jax.control.plants.exploring import NEAR, Exploration, explore
+from dln_jax.control.plants.planned import by_repeated_plans, inner_ranges
 from dln_jax.control.plants.plant import layout, plant_of
-from dln_jax.control.plants.recovery import recovering
 from dln_jax.control.plants.runs import compiled, distances, judged_runs, run, start_of
-from dln_jax.control.plants.scales import USUAL, circle, scales_of, swing_up_numbers
 from dln_jax.control.plants.tuning import trial_of, tune
 from dln_jax.control.state_space import field_of
-from dln_jax.control.swing_up import upright_of
+from dln_jax.control.swing_up import USUAL, swing_up_numbers, upright_of
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.pendulums import cart_pole
 
@@ -33,13 +32,12 @@ def model(**sizes):
 
 
 def scaled(plant, **sizes):
-    upright = upright_of(model(**sizes), plant.actuation, plant.goal, postures=circle(plant))
-    return upright, scales_of(upright, plant)
+    return upright_of(model(**sizes), plant)
 
 
 def test_scales_of_a_cart_pole_have_closed_forms():
     plant = rail()
-    _, scales = scaled(plant)
+    scales = scaled(plant).scales
     m, l, g = SIZES["pole_mass"], SIZES["length"], 9.81
     assert scales.fall == pytest.approx(np.sqrt(g / l))
     assert scales.energy == pytest.approx(2 * m * g * l, rel=1e-6)
@@ -54,19 +52,23 @@ def test_scales_of_a_cart_pole_have_closed_forms():
 def test_similar_plants_get_the_same_law_in_their_own_units():
     """Masses and forces 3 times as large leave accelerations, and the regulator's feedback grows as the force."""
     large = rail(24.0)
-    one, first = swing_up_numbers(scaled(rail())[0], rail(), scaled(rail())[1], USUAL)
-    upright, scales = scaled(large, cart_mass=1.8, pole_mass=0.45)
-    other, second = swing_up_numbers(upright, large, scales, USUAL)
-    assert_allclose(second.K, 3 * np.asarray(first.K), rtol=1e-6)
+    one = swing_up_numbers(scaled(rail()), USUAL)
+    other = swing_up_numbers(scaled(large, cart_mass=1.8, pole_mass=0.45), USUAL)
+    assert_allclose(other.regulator.K, 3 * np.asarray(one.regulator.K), rtol=1e-6)
     assert other.level == pytest.approx(one.level, rel=1e-6) and other.kick == pytest.approx(3 * one.kick)
     # k E M_ap qd_p is an acceleration, where E and M_ap grow by 3 each.
     assert other.gains.energy == pytest.approx(one.gains.energy / 9, rel=1e-6)
     assert_allclose(other.gains[1:3], one.gains[1:3], rtol=1e-6)
 
 
+def test_a_share_of_a_range_is_its_middle():
+    limits = rail().limits._replace(position=np.array([[1.0, 2.0], [-np.inf, 3.0]]))
+    assert_allclose(inner_ranges(rail()._replace(limits=limits), 0.8), [[1.1, -np.inf], [1.9, 3.0]])
+
+
 def test_on_the_surface_of_the_catch_region_the_regulator_asks_for_the_motors_limit():
-    upright, scales = scaled(rail())
-    numbers, regulator = swing_up_numbers(upright, rail(), scales, {**USUAL, "catch": 1.0})
+    numbers = swing_up_numbers(scaled(rail()), {**USUAL, "catch": 1.0})
+    regulator = numbers.regulator
     directions = np.random.default_rng(0).normal(size=(20000, 4)) @ np.linalg.inv(np.linalg.cholesky(regulator.S))
     sizes = np.sqrt(np.einsum("ni,ij,nj->n", directions, regulator.S, directions))
     asked = np.abs((np.sqrt(numbers.level) * directions / sizes[:, None]) @ np.asarray(regulator.K).T).max()
@@ -96,9 +98,8 @@ def test_episodes_of_an_exploration_follow_a_plan_where_none_came_near_the_goal(
 @pytest.mark.slow
 def test_repeated_plans_swing_up_within_the_rail():
     plant = rail()
-    upright, scales = scaled(plant)
-    settings, regulator = swing_up_numbers(upright, plant, scales, USUAL)
-    law = recovering(upright, plant, scales, settings, regulator, settings.level)
+    upright = scaled(plant)
+    law = by_repeated_plans(upright, swing_up_numbers(upright, USUAL))
     field, motors = field_of(model(), plant.actuation), Hardware(-8.0, 8.0)
     start = jnp.array([0.0, np.pi + 0.1, 0.0, 0.0])
     x = jax.jit(lambda: simulate(field, law, start, seconds=3.0, rate=100.0, controls=1, hardware=motors).x)()
@@ -106,7 +107,7 @@ def test_repeated_plans_swing_up_within_the_rail():
 
 
 def trial(law, plant, hardware, late=0.0):
-    return trial_of(lambda _: stateless(law), model(), plant, hardware, seconds=2.0, substeps=1, late=late)
+    return trial_of(lambda _: stateless(law), model(), plant, hardware, seconds=2.0, late=late)
 
 
 def test_motors_a_whole_sample_late_are_hardware_with_that_delay():
