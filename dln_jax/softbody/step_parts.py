@@ -38,7 +38,7 @@ from dln_jax.solvers.elements.energies import Corners, ElementEnergy, value
 from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory
 from dln_jax.solvers.elements.minimise import minimise
 from dln_jax.solvers.elements.moving import lists_between, moving_gradient
-from dln_jax.solvers.elements.selection import known_data, requested_or_chosen
+from dln_jax.solvers.elements.selection import known_data, least_work
 from dln_jax.solvers.newton import SolverInfo
 from dln_jax.types import InputError, require_positive
 
@@ -123,13 +123,13 @@ def step_parts(
             *along(lambda _: rest, prepare(scene, scene.params, rest, dt=dt)),
         ),
     )
-    chosen = requested_or_chosen(linear_solver, energies, at, rest, known)
+    solver = (linear_solver or least_work(energies, at, rest, known))(energies, at)
     solve = partial(
         minimise,
         free=free,
         tolerance=tolerance,
         iterations=iterations,
-        linear_solver=chosen,
+        linear_solver=lambda *_: solver,
         definite=definite,
         moving=moving,
     )

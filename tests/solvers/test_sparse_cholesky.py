@@ -9,9 +9,9 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import Delaunay
 
 from dln_jax.solvers.elements.assembly import Pattern, pattern
-from dln_jax.solvers.elements.dissection import bisect
 from dln_jax.solvers.elements.energies import ElementEnergy
 from dln_jax.solvers.elements.linear_solvers import sparse
+from dln_jax.solvers.elements.sparse_cholesky import bisect, coordinates
 
 
 def grid(*counts):
@@ -93,6 +93,7 @@ def test_a_matrix_that_is_not_definite_has_no_finite_solution():
 def test_the_separator_of_a_box_is_its_cross_section():
     pairs = grid(20, 6, 5)
     both = np.concatenate([pairs, pairs[:, ::-1]])
-    left, right, separator = bisect(csr_array(coo_array((np.ones(len(both)), both.T), shape=(600, 600))))
+    graph = csr_array(coo_array((np.ones(len(both)), both.T), shape=(600, 600)))
+    left, right, separator = bisect(graph, coordinates(graph))
     assert len(separator) == 30 and min(len(left), len(right)) >= 0.3 * 600
     assert sorted(np.concatenate([left, right, separator])) == list(range(600))
