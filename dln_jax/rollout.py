@@ -32,10 +32,11 @@ def rollout(
     Raises:
         InputError: neither inputs nor steps, or a segment that does not divide the number of steps.
     """
-    count = steps if inputs is None else jax.tree.leaves(inputs)[0].shape[0]
+    leaves = jax.tree.leaves(inputs)
+    count = leaves[0].shape[0] if leaves else steps
     if count is None:
         raise InputError("there are neither inputs nor steps; give one of them")
-    if inputs is None:
+    if not leaves:
         require_positive(steps=count)
 
     def advance(state: Any, input: Any) -> tuple[Any, Any]:

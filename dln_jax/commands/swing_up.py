@@ -1,9 +1,9 @@
 """Swing up a pole with a model that was learned from it: explore the plant, learn, design a controller, close the loop.
 
 The plant is an MJCF or URDF file: a cart-pole, a rotary pendulum, an acrobot, a pendubot, or another chain with a
-passive joint; cart-pole and furuta name two files of the library, desktop plants with dry friction. MuJoCo simulates
-it, with encoders and torques that act a sample late. It is explored without a model; only q and the commanded torques
-are recorded. Models: identified (rigid bodies, linear in its parameters), delan (a structured deep Lagrangian network
+passive joint; cart-pole and rotary-pendulum name two files of the library, desktop plants with dry friction. MuJoCo
+simulates it, with encoders and torques that act a sample late. It is explored without a model; only q and the commanded
+torques are recorded. Models: identified (rigid bodies, linear in its parameters), delan (a structured deep Lagrangian network
 with friction), known (the file's bodies and friction), analytic (the same without friction). Trials of the model choose
 all gains, and the law gets its states from a Kalman filter of the model.
 
@@ -20,8 +20,8 @@ from dln_jax.options import Drawn, Folder, Unstated, choice
 class Arguments(Folder, Drawn):
     """Plant, model, and where the results go."""
 
-    plant: Annotated[str, choice(("rotary-pendulum", "cart-pole", "FILE"))] = "furuta"
-    """The plant; furuta is a rotary pendulum. FILE is the path of an MJCF or URDF file."""
+    plant: Annotated[str, choice(("rotary-pendulum", "cart-pole", "FILE"))] = "rotary-pendulum"
+    """The plant; furuta is another name of the rotary pendulum. FILE is the path of an MJCF or URDF file."""
     actuated: Unstated[str] = None
     """Joints with a motor, comma-separated names or numbers from 0 (default: those with an actuator or a
     transmission)."""

@@ -1,6 +1,5 @@
 """Static equilibria: minima of the potential without inertia."""
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -23,7 +22,7 @@ from dln_jax.softbody.verdict import (
 from dln_jax.solvers.elements.assembly import pattern
 from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory
 from dln_jax.solvers.elements.minimise import minimise
-from dln_jax.solvers.elements.selection import known_data, requested_or_chosen
+from dln_jax.solvers.elements.selection import known_data, least_work
 
 
 def static_solve(
@@ -50,10 +49,21 @@ def static_solve(
     energies, (count, dimension) = element_energies(scene), scene.mesh.vertices.shape
     at = pattern(energies, count, dimension, scene.free)
     known = known_data((params, x, control), lambda: data)
-    chosen = requested_or_chosen(linear_solver, energies, at, x, known)
-    solve = partial(minimise, tolerance=tolerance, iterations=iterations, linear_solver=chosen, definite=definite)
+    solver = (linear_solver or least_work(energies, at, x, known))(energies, at)
     contact = prepare_contacts(scene, params, x)
-    solve = partial(solve, moving=contact_energies(scene), moving_data=contact)
-    x, outcome = solve(energies, x, data, free=scene.free, scale=params.masses, at=at)
+    x, outcome = minimise(
+        energies,
+        x,
+        data,
+        free=scene.free,
+        scale=params.masses,
+        tolerance=tolerance,
+        iterations=iterations,
+        linear_solver=lambda *_: solver,
+        at=at,
+        definite=definite,
+        moving=contact_energies(scene),
+        moving_data=contact,
+    )
     info = verdict_on_positions(scene, *jax.lax.stop_gradient((params, x, outcome)), contact)
     return trusted(x, info.converged), info

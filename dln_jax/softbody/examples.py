@@ -15,19 +15,21 @@ creature is the published preset of `terms.creature`.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from dln_jax.softbody.contact.barrier import Contact
 from dln_jax.softbody.contact.bodies import body_contact
-from dln_jax.softbody.driven import Example
 from dln_jax.softbody.mesh.mesh import Mesh, boundary, lumped_masses, vertices_where
 from dln_jax.softbody.mesh.shapes import Creature, body_length, box, crawler, disc, quadratic, with_midsides
 from dln_jax.softbody.mesh.shapes import beam as beam_mesh
 from dln_jax.softbody.scene import SoftScene, make_scene
+from dln_jax.softbody.step import Motion
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.creature import MASS, TIME_STEP, Bumps, creature_terms
 from dln_jax.softbody.terms.elasticity import elastic
@@ -56,6 +58,36 @@ WAVE_DELAY = math.pi / 4
 """Phase delay of the back relative to the rest of the skin, in rad."""
 SHORTEST, LONGEST = 0.3, 1.0
 """Range of the actuation of the creature's muscles."""
+
+
+class Example(NamedTuple):
+    """A scene with its initial velocities and its drive."""
+
+    scene: SoftScene
+    dt: float
+    """Suitable time step in s."""
+    seconds: float
+    """Duration of an illustrative motion in s."""
+    v: Any = 0.0
+    """Initial velocities in m/s, [n, dim] or one for all; the body starts in its rest shape."""
+    ground: float | None = None
+    """Slope of the ground (rise over run), which passes through the origin; `None` without ground."""
+    control: Callable[[np.ndarray], Any] | None = None
+    """Times [T] in s -> actuation [T, k], or a dict of such arrays by actuator."""
+    held_path: Callable[[np.ndarray], np.ndarray] | None = None
+    """Times [T] in s -> positions of the held vertices [T, k, dim]; by default they stay."""
+    muscles: np.ndarray | None = None
+    """Pairs of vertices [k, 2], for figures."""
+    moments: tuple[float, ...] = (0.0,)
+    """Times in s that figures show."""
+
+
+def inputs(example: Example, dt: float, steps: int, *, first: int = 0) -> tuple[Any, Motion | None]:
+    """Returns the controls and motions of `steps` steps of dt in s from step `first` on, at their ends."""
+    t, dtype = dt * np.arange(first + 1, first + steps + 1), example.scene.params.rest.dtype
+    control = None if example.control is None else example.control(t)
+    motion = None if example.held_path is None else Motion(held=jnp.asarray(example.held_path(t)))
+    return jax.tree.map(lambda of: jnp.asarray(of, dtype), (control, motion))
 
 
 Loads = Callable[[Mesh], Sequence[Term]]

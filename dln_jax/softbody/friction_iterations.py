@@ -64,30 +64,25 @@ def iterated(
 def friction_change(
     scene: SoftScene,
     energies: Sequence[ElementEnergy],
-    touching: Sequence[MovingEnergy],
+    moving: Sequence[MovingEnergy],
     x: Float[Array, "n dim"],
-    before: tuple[Sequence[Any], Sequence[Any]],
-    after: tuple[Sequence[Any], Sequence[Any]],
+    before: Any,
+    after: Any,
 ) -> Float[Array, ""]:
-    """Returns the largest change of friction at x between two sets of normal forces, as force per mass in m/s².
-
-    Args:
-        energies: energies of the terms.
-        touching: energies of the contacts.
-        before, after: data of the terms, and of the contacts' energies.
-    """
-    lagged = [number for number, term in enumerate(scene.terms) if term.lagged]
+    """Returns the largest change of friction at x between the data of two steps, as force per mass in m/s²."""
+    # The first energy is inertia.
+    lagged = [number for number, term in enumerate(scene.terms, start=1) if term.lagged]
     rubs = [energy in contact.friction for contact in scene.contacts for energy in contact.energies]
-    sliding = [energy for energy, has in zip(touching, rubs, strict=True) if has]
+    sliding = [number for number, has in enumerate(rubs) if has]
 
-    def forces(of_terms: Sequence[Any], of_contacts: Sequence[Any]) -> Array:
+    def forces(step: Any) -> Array:
         slope = jnp.zeros_like(x)
         if lagged:
-            chosen = [energies[number] for number in lagged], [of_terms[number] for number in lagged]
-            slope += jax.grad(lambda x: value(chosen[0], x, chosen[1]))(x)
-        data = [of for of, has in zip(of_contacts, rubs, strict=True) if has]
-        lists = tuple(energy.elements(x, slope, of) for energy, of in zip(sliding, data, strict=True))
-        return slope + moving_gradient(sliding, x, lists, data)[1]
+            rubbing, own = [energies[number] for number in lagged], [step.energies[number] for number in lagged]
+            slope += jax.grad(lambda x: value(rubbing, x, own))(x)
+        chosen, data = [moving[number] for number in sliding], [step.moving[number] for number in sliding]
+        lists = tuple(energy.elements(x, slope, of) for energy, of in zip(chosen, data, strict=True))
+        return slope + moving_gradient(chosen, x, lists, data)[1]
 
-    change = jnp.abs(forces(*after) - forces(*before)) / scene.params.masses[:, None]
+    change = jnp.abs(forces(after) - forces(before)) / scene.params.masses[:, None]
     return jnp.max(jnp.where(scene.free, change, 0))

@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.scene import Previous, State
-from dln_jax.solvers.elements.energies import Blocks, Corners, ElementEnergy, local, of_corners
+from dln_jax.solvers.elements.energies import Blocks, Corners, ElementEnergy, of_corners
 from dln_jax.solvers.elements.moving import Elements, MovingEnergy
 from dln_jax.types import InputError
 
@@ -101,7 +101,10 @@ INTEGRATORS = {
 
 
 def averaged(element: ElementEnergy, dimension: int) -> ElementEnergy:
-    """Returns the element energy W of a body in 2 or 3 dimensions; its data are those of `averaged_data`."""
+    """Returns the element energy W of a body in 2 or 3 dimensions.
+
+    Its data are the elements' positions at the start of the step, and their own data.
+    """
     solid = element.indices.shape[1] > dimension
     nodes, weights = np.polynomial.legendre.leggauss(dimension if solid else CONTACT_POINTS)
     nodes, weights = (1 + nodes) / 2, weights / 2
@@ -121,11 +124,6 @@ def averaged(element: ElementEnergy, dimension: int) -> ElementEnergy:
         return jnp.sum(weights / nodes * jax.vmap(at)(jnp.asarray(nodes, x[0][0].dtype)))
 
     return element._replace(energy=energy, weights=None)
-
-
-def averaged_data(element: ElementEnergy, start: Float[Array, "n dim"], data: Any) -> tuple[Any, Any]:
-    """Returns the data of `averaged`: the elements' positions at the start of the step, and their own data."""
-    return local(element, start), data
 
 
 def averaged_moving(energy: MovingEnergy) -> MovingEnergy:

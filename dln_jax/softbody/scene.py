@@ -4,7 +4,8 @@ Terms that a scene does not list are never traced. Everything in `Params` is dif
 """
 
 import reprlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -44,7 +45,7 @@ class SoftScene(NamedTuple):
     mesh: Mesh
     terms: tuple[Term, ...]
     held: Int[np.ndarray, " k"]
-    """Vertices that are not solved for: they move with their prescribed velocity in `State.v`."""
+    """Vertices that are not solved for: they move as `Motion` says, or with their velocity in `State.v`."""
     params: Params
     """Default parameters."""
     contacts: tuple[Contact, ...] = ()
@@ -158,7 +159,8 @@ def with_parameters(params: Params, **terms: Mapping[str, Any]) -> Params:
     """Returns the parameters with some values replaced: `with_parameters(params, elastic={"youngs_modulus": 2e5})`.
 
     Args:
-        terms: new values by term and parameter name; numbers or arrays, traced or not.
+        terms: new values by term and parameter name; numbers or arrays, traced or not. A name may be that of a value
+            within a parameter, such as the `centre` of an obstacle's shape.
 
     Raises:
         InputError: the scene does not have such a term or parameter.
@@ -167,19 +169,37 @@ def with_parameters(params: Params, **terms: Mapping[str, Any]) -> Params:
     for name, values in terms.items():
         if name not in replaced:
             raise InputError(f"the scene has no term '{name}'; expected one of {', '.join(replaced)}")
-        if unknown := [field for field in values if field not in replaced[name]._fields]:
-            fields = ", ".join(replaced[name]._fields)
-            raise InputError(f"term '{name}' has no parameter '{unknown[0]}'; expected one of {fields}")
-        replaced[name] = replaced[name]._replace(
-            **{
-                field: _like(name, field, value, getattr(replaced[name], field), params)
-                for field, value in values.items()
-            }
-        )
+        for field, new in values.items():
+            like = partial(_like, name, field, new, params)
+            changed = _with_value(replaced[name], field, like)
+            if changed is None:
+                fields = ", ".join(_names(replaced[name]))
+                raise InputError(f"term '{name}' has no parameter '{field}'; expected one of {fields}")
+            replaced[name] = changed
     return params._replace(terms=replaced)
 
 
-def _like(name: str, field: str, value: Any, before: Any, params: Params) -> Any:
+def _with_value(record: Any, field: str, value_for: Callable[[Any], Any]) -> Any:
+    """Returns the record with a new value of its field, or of that of a record in it; `None` if there is none."""
+    if field in record._fields:
+        return record._replace(**{field: value_for(getattr(record, field))})
+    for place, inner in record._asdict().items():
+        changed = _with_value(inner, field, value_for) if hasattr(inner, "_fields") else None
+        if changed is not None:
+            return record._replace(**{place: changed})
+    return None
+
+
+def _names(record: Any) -> Iterator[str]:
+    """Yields the names of a record's values, and of those of the records in it."""
+    for name, inner in record._asdict().items():
+        if hasattr(inner, "_fields"):
+            yield from _names(inner)
+        else:
+            yield name
+
+
+def _like(name: str, field: str, value: Any, params: Params, before: Any) -> Any:
     """Converts a new parameter value to the precision of the scene; refuses a shape that does not fit."""
     if not isinstance(before, Array | np.ndarray | float | int):
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, params.rest.dtype), value)

@@ -1,34 +1,51 @@
 """Implicit time steps that minimise the potential of `integrators` (Rojas et al. 2021; Martin et al. 2011)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
-from jaxtyping import Array
+import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from dln_jax.softbody.integrators import BACKWARD_EULER, Integrator
 from dln_jax.softbody.scene import (
     Params,
     SoftScene,
     State,
+    with_parameters,
 )
-from dln_jax.softbody.step_parts import step_parts
+from dln_jax.softbody.step_parts import balance, conclude, initial_state, step_problem
 from dln_jax.softbody.substeps import with_shorter_steps
 from dln_jax.softbody.verdict import TOLERANCE, Info
 from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory
 from dln_jax.types import InputError, require_positive
 
-Step = Callable[[Params, State, Any], tuple[State, Info]]
+Step = Callable[..., tuple[Any, Info]]
+
+
+class Motion(NamedTuple):
+    """What moves held vertices and rigid surfaces in a step; what is `None` is not moved."""
+
+    held: Float[Array, "k dim"] | None = None
+    """Positions in m of the scene's held vertices at the end of the step, in ascending order of the vertices. Without
+    them, held vertices keep their velocity."""
+    surfaces: Mapping[str, Mapping[str, Any]] | None = None
+    """Places of planes and obstacles at the end of the step, as for `with_parameters`: {"belt": {"centre": c}}.
+    Friction and damping take their velocity from the step before. Other surfaces are where the parameters say."""
+    torque: Float[Array, " d"] | None = None
+    """Generalised forces in N m or N at the joints of a robot (`make_tied_step`) at the end of the step."""
 
 
 class Stepper(NamedTuple):
     """A time step and its initial state."""
 
-    init: Callable[..., State]
+    init: Callable[..., Any]
     """init(x=None, v=None): by default the rest shape at rest; positions in m and velocities in m/s are [n, dim] or one
     [dim] for all vertices. Raises `InputError` for a known value that is not finite."""
     step: Step
-    """step(params, state, control=None) -> (state after dt, Info): differentiable in all of its arguments. The control
-    is an array for the scene's only actuator, or a dict of arrays by the names of the actuated terms."""
+    """step(params, state, control=None, motion=None) -> (state after dt, Info): differentiable in all of its arguments.
+    The control is an array for the scene's only actuator, or a dict of arrays by the names of the actuated terms; the
+    motion is a `Motion`."""
 
 
 def make_step(
@@ -68,8 +85,12 @@ def make_step(
         require_positive(halvings=halvings)
         if integrator.two_steps:
             raise InputError("halvings got a method of two steps, which have one length; use another integrator")
-    init, balance, _, conclude = step_parts(
-        *(scene, dt, integrator, tolerance, iterations),
+    problem = step_problem(
+        scene,
+        dt,
+        integrator,
+        tolerance=tolerance,
+        iterations=iterations,
         linear_solver=linear_solver,
         definite=definite,
         friction_iterations=friction_iterations,
@@ -78,11 +99,28 @@ def make_step(
     def advance(
         params: Params, state: State, control: Any = None, dt: Any = dt, x_after: Array | None = None
     ) -> tuple[State, Info]:
-        return conclude(params, state, balance(params, state, control, dt, x_after), dt)
+        return conclude(problem, params, state, balance(problem, params, state, control, dt, x_after), dt)
 
-    if halvings:
-        return Stepper(init, with_shorter_steps(advance, dt, halvings))
-    return Stepper(init, lambda params, state, control=None: advance(params, state, control))
+    whole = with_shorter_steps(advance, dt, halvings) if halvings else advance
+
+    def step(params: Params, state: State, control: Any = None, motion: Motion | None = None) -> tuple[State, Info]:
+        if motion is not None and motion.torque is not None:
+            raise InputError("the motion has a torque, but no robot carries the scene; use make_tied_step")
+        return whole(*moved(scene, params, state, motion, dt), control)
+
+    return Stepper(partial(initial_state, problem), step)
+
+
+def moved(scene: SoftScene, params: Params, state: State, motion: Motion | None, dt: Any) -> tuple[Params, State]:
+    """Returns the parameters with the surfaces' places, and the state with the velocities of held vertices."""
+    if motion is not None and motion.held is not None:
+        held, (k, dimension) = jnp.asarray(motion.held, state.x.dtype), (len(scene.held), scene.mesh.dimension)
+        if held.shape != (k, dimension):
+            raise InputError(f"the motion moves held vertices to {held.shape} numbers; expected {k, dimension}")
+        state = state._replace(v=state.v.at[scene.held].set((held - state.x[scene.held]) / dt))
+    if motion is not None and motion.surfaces is not None:
+        params = with_parameters(params, **motion.surfaces)
+    return params, state
 
 
 def positions_and_convergence(state: State, info: Info) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.friction_iterations import friction_change, has_friction, iterated
-from dln_jax.softbody.integrators import BACKWARD_EULER, Integrator, averaged, averaged_data, averaged_moving
+from dln_jax.softbody.integrators import BACKWARD_EULER, Integrator, averaged, averaged_moving
 from dln_jax.softbody.scene import (
     Growth,
     Params,
@@ -34,13 +34,41 @@ from dln_jax.softbody.verdict import (
     work_of_held,
 )
 from dln_jax.solvers.elements.assembly import pattern
-from dln_jax.solvers.elements.energies import Corners, ElementEnergy, value
+from dln_jax.solvers.elements.energies import Corners, ElementEnergy, local, value
 from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory
 from dln_jax.solvers.elements.minimise import minimise
-from dln_jax.solvers.elements.moving import lists_between, moving_gradient
-from dln_jax.solvers.elements.selection import known_data, requested_or_chosen
+from dln_jax.solvers.elements.moving import MovingEnergy, lists_between, moving_gradient
+from dln_jax.solvers.elements.selection import known_data, least_work
 from dln_jax.solvers.newton import SolverInfo
 from dln_jax.types import InputError, require_positive
+
+
+class Problem(NamedTuple):
+    """The minimisation of every step, as far as it is known before tracing."""
+
+    scene: SoftScene
+    integrator: Integrator
+    dt: Any
+    """Length of a whole step, in s."""
+    energies: tuple[ElementEnergy, ...]
+    """Inertia, then the terms, averaged along the step if the integrator averages."""
+    moving: tuple[MovingEnergy, ...]
+    """Contacts, averaged likewise."""
+    minimise: Callable[..., tuple[Array, SolverInfo]]
+    """`minimise` for these energies, with the settings of the step."""
+    friction_iterations: int
+    """Zero without friction."""
+
+
+class StepData(NamedTuple):
+    """Data of one step with the normal forces of friction at some positions."""
+
+    terms: tuple[Any, ...]
+    """Data of the scene's terms."""
+    energies: tuple[Any, ...]
+    """Data of `Problem.energies`."""
+    moving: tuple[Any, ...]
+    """Data of `Problem.moving`."""
 
 
 class Balanced(NamedTuple):
@@ -49,40 +77,23 @@ class Balanced(NamedTuple):
     x: Float[Array, "n dim"]
     """In m."""
     outcome: SolverInfo
-    at_start: tuple[Any, ...]
-    """Data of the scene's terms."""
-    data: tuple[Any, ...]
-    """Data of the step's energies: of inertia, then of the terms, averaged if the integrator averages."""
-    contact: tuple[Any, ...]
-    """Data of the contacts."""
+    data: StepData
     friction_change: Float[Array, ""] | None = None
     """As in `Info`."""
 
 
-class StepParts(NamedTuple):
-    """A time step in two parts, for callers that also solve for the motion of held vertices."""
-
-    init: Callable[..., State]
-    balance: Callable[..., Balanced]
-    """balance(params, state, control, dt, x_after=None): x_after starts the search."""
-    forces: Callable[[Balanced], Float[Array, "n dim"]]
-    """Forces of the energies and of inertia on all vertices, in N: zero on free ones."""
-    conclude: Callable[..., tuple[State, Info]]
-    """conclude(params, state, balanced, dt): the state after the step, and the verdict."""
-
-
-def step_parts(
+def step_problem(
     scene: SoftScene,
     dt: Any,
     integrator: Integrator = BACKWARD_EULER,
+    *,
     tolerance: float = TOLERANCE,
     iterations: int = 100,
-    *,
     linear_solver: LinearSolverFactory | None = None,
     definite: bool = False,
     friction_iterations: int = 1,
-) -> StepParts:
-    """Returns the parts of the step that `make_step` returns; arguments are explained there."""
+) -> Problem:
+    """Returns the minimisation of the step that `make_step` returns; arguments are explained there."""
     if friction_iterations:
         require_positive(friction_iterations=friction_iterations)
     if not isinstance(dt, Tracer):
@@ -97,147 +108,177 @@ def step_parts(
             "forces between bodies cannot be averaged along the step, because the pairs that touch change; "
             "use BACKWARD_EULER or BDF2"
         )
-    free, whole = scene.free, dt
-    terms = stored = element_energies(scene)
+    terms, moving, params = element_energies(scene), contact_energies(scene), scene.params
     if integrator.averaged:
-        terms = tuple(averaged(element, scene.mesh.dimension) for element in stored)
-    energies = (ElementEnergy(_inertia, np.arange(len(free))[:, None], unrolled=True), *terms)
-    at = pattern(energies, free.shape[0], free.shape[1], free)
-    touching = contact_energies(scene)
-    touched = [contact.name for contact in scene.contacts for _ in contact.energies]
-    moving = tuple(map(averaged_moving, touching)) if integrator.averaged else touching
-    iterating = friction_iterations > 0 and has_friction(scene)
-    rest, masses = scene.params.rest, scene.params.masses
-
-    def along(start: Callable[[str], Array], data: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Returns the data of the terms, averaged along the step if the integrator averages."""
-        if not integrator.averaged:
-            return data
-        starts = [start(term.name) for term in scene.terms]
-        return tuple(map(averaged_data, stored, starts, data))
-
+        terms = tuple(averaged(element, scene.mesh.dimension) for element in terms)
+        moving = tuple(map(averaged_moving, moving))
+    vertices = np.arange(len(scene.free))[:, None]
+    energies = (ElementEnergy(_inertia, vertices, unrolled=True), *terms)
+    problem = Problem(
+        *(scene, integrator, dt, energies, moving, minimise),
+        friction_iterations if has_friction(scene) else 0,
+    )
+    at = pattern(energies, len(scene.free), scene.mesh.dimension, scene.free)
+    rest = params.rest
     known = known_data(
-        (scene.params, dt),
+        (params, dt),
         lambda: (
-            (masses / (integrator.span * dt) ** 2, rest),
-            *along(lambda _: rest, prepare(scene, scene.params, rest, dt=dt)),
+            step_data(
+                problem,
+                params,
+                State(rest, jnp.zeros_like(rest)),
+                (params.masses / (integrator.span * dt) ** 2, rest),
+                dt=dt,
+            ).energies
         ),
     )
-    chosen = requested_or_chosen(linear_solver, energies, at, rest, known)
-    solve = partial(
-        minimise,
-        free=free,
-        tolerance=tolerance,
-        iterations=iterations,
-        linear_solver=chosen,
-        definite=definite,
-        moving=moving,
+    solver = (linear_solver or least_work(energies, at, rest, known))(energies, at)
+    return problem._replace(
+        minimise=partial(
+            minimise,
+            energies,
+            free=scene.free,
+            at=at,
+            tolerance=tolerance,
+            iterations=iterations,
+            linear_solver=lambda *_: solver,
+            definite=definite,
+            moving=moving,
+        )
     )
 
-    def init(x: Any = None, v: Any = None) -> State:
-        x, v = scene.mesh.vertices if x is None else x, 0.0 if v is None else v
-        for name, values in (("x", x), ("v", v)):
-            known = not isinstance(values, Tracer)
-            if known and len(wrong := np.argwhere(~np.isfinite(np.broadcast_to(np.asarray(values), free.shape)))):
-                raise InputError(f"{name} of vertex {wrong[0][0]} is not finite; expected numbers")
-        x, v = (jnp.broadcast_to(jnp.asarray(values, float), free.shape) for values in (x, v))
-        previous = Previous(x, v, jnp.asarray(False)) if integrator.two_steps else None
-        poses = (jnp.asarray(False), scene.params.poses) if scene.params.poses else None
-        return State(x, v, previous, Growth(jnp.zeros((), x.dtype), jnp.zeros((), x.dtype)), poses)
 
-    def balance(params: Params, state: State, control: Any, dt: Any, x_after: Array | None = None) -> Balanced:
-        h, target = integrator.target(state, dt)
-        span = jnp.asarray(integrator.span * dt, state.x.dtype)
-        weights = params.masses / jnp.asarray(h, state.x.dtype) ** 2
-        # Averaging along the step halves a linear damping force; half the time makes it that of the mean velocity.
-        elapsed = span / 2 if integrator.averaged else span
-        before = {}
-        if state.poses is not None:
-            known, last = state.poses
-            share = jnp.asarray(known * integrator.span * dt / whole, span.dtype)
-            before = jax.tree.map(lambda now, then: now + share * (then - now), params.poses, last)
+def initial_state(problem: Problem, x: Any = None, v: Any = None) -> State:
+    """Returns `Stepper.init(x, v)`."""
+    scene = problem.scene
+    x, v = scene.mesh.vertices if x is None else x, 0.0 if v is None else v
+    for name, values in (("x", x), ("v", v)):
+        known = not isinstance(values, Tracer)
+        if known and len(wrong := np.argwhere(~np.isfinite(np.broadcast_to(np.asarray(values), scene.free.shape)))):
+            raise InputError(f"{name} of vertex {wrong[0][0]} is not finite; expected numbers")
+    x, v = (jnp.broadcast_to(jnp.asarray(values, float), scene.free.shape) for values in (x, v))
+    previous = Previous(x, v, jnp.asarray(False)) if problem.integrator.two_steps else None
+    poses = (jnp.asarray(False), scene.params.poses) if scene.params.poses else None
+    return State(x, v, previous, Growth(jnp.zeros((), x.dtype), jnp.zeros((), x.dtype)), poses)
 
-        def begun(name: str) -> Array:
-            """Returns the start of the way relative to a surface, along which its forces are averaged."""
-            return state.x + motion_of(name, params.terms[name], before, state.x)
 
-        def prepared(lag: Array | None) -> tuple[Any, Any, Any]:
-            at_start = prepare(scene, params, state.x, dt=elapsed, control=control, lag=lag, before=before)
-            contact = prepare_contacts(scene, params, state.x, dt=elapsed, lag=lag, before=before)
-            contact = tuple(zip(map(begun, touched), contact, strict=True)) if integrator.averaged else contact
-            return at_start, ((weights, target), *along(begun, at_start)), contact
+def step_data(
+    problem: Problem, params: Params, state: State, inertia: tuple[Array, Array], control: Any = None, **settings: Any
+) -> StepData:
+    """Returns the data of a step with these weights and targets of inertia; the settings are those of `prepare`."""
+    scene = problem.scene
+    terms = prepare(scene, params, state.x, control=control, **settings)
+    contacts = prepare_contacts(scene, params, state.x, **settings)
+    if not problem.integrator.averaged:
+        return StepData(terms, (inertia, *terms), contacts)
 
-        first = prepared(None)
-        data = first[1]
-        carried = state.x + span * state.v
-        if moving:
-            start = state.x if x_after is None else x_after
-        elif x_after is None:
-            # The better of two starts: the current positions, or those of a motion without forces.
-            stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
-            of_coast, of_stay = jax.vmap(lambda x: value(energies, x, data))(jnp.stack([coast, stay]))
-            start = jnp.where(of_coast < of_stay, coast, stay)
-        else:
-            start = jnp.where(free, state.x + integrator.span * (x_after - state.x), carried)
+    def start(name: str) -> Array:
+        """Returns the start of the way relative to a surface, along which its forces are averaged."""
+        return state.x + motion_of(name, params.terms[name], settings.get("before"), state.x)
 
-        def from_start(outcome: SolverInfo, contact: Any) -> SolverInfo:
-            """Returns the outcome with the lists at the start of the step, if the search began elsewhere."""
-            there = lists_between(moving, state.x, jnp.zeros_like(state.x), contact)
-            return outcome._replace(lists=(there, outcome.lists[1]))
+    of_step = zip(scene.terms, element_energies(scene), terms, strict=True)
+    names = [contact.name for contact in scene.contacts for _ in contact.energies]
+    return StepData(
+        terms,
+        (inertia, *((local(element, start(term.name)), data) for term, element, data in of_step)),
+        tuple((start(name), data) for name, data in zip(names, contacts, strict=True)),
+    )
 
-        def solved(x: Array, parts: tuple[Any, Any, Any]) -> tuple[Array, SolverInfo]:
-            _, data, contact = parts
-            # Only known positions are known to be apart; held vertices approach their targets from there.
-            start, feasible = jnp.where(free, x, carried), x if moving else None
-            return solve(energies, start, data, scale=params.masses, at=at, moving_data=contact, start=feasible)
 
-        if not iterating:
-            x, outcome = solved(start, first)
-            return Balanced(x, outcome if x_after is None else from_start(outcome, first[2]), *first)
+def balance(
+    problem: Problem, params: Params, state: State, control: Any, dt: Any, x_after: Array | None = None
+) -> Balanced:
+    """Returns the minimum of the step; x_after starts the search."""
+    integrator, free = problem.integrator, problem.scene.free
+    h, target = integrator.target(state, dt)
+    span = jnp.asarray(integrator.span * dt, state.x.dtype)
+    carried = state.x + span * state.v
+    inertia = params.masses / jnp.asarray(h, state.x.dtype) ** 2, target
+    before = {}
+    if state.poses is not None:
+        known, last = state.poses
+        share = jnp.asarray(known * integrator.span * dt / problem.dt, span.dtype)
+        before = jax.tree.map(lambda now, then: now + share * (then - now), params.poses, last)
+    # Averaging along the step halves a linear damping force; half the time makes it that of the mean velocity.
+    elapsed = span / 2 if integrator.averaged else span
+
+    def prepared(lag: Array | None) -> StepData:
+        return step_data(problem, params, state, inertia, control, dt=elapsed, lag=lag, before=before)
+
+    def solved(x: Array, data: StepData) -> tuple[Array, SolverInfo]:
+        # Only known positions are known to be apart; held vertices approach their targets from there.
+        start, feasible = jnp.where(free, x, carried), x if problem.moving else None
+        return problem.minimise(start, data.energies, scale=params.masses, moving_data=data.moving, start=feasible)
+
+    first = prepared(None)
+    if problem.moving:
+        start = state.x if x_after is None else x_after
+    elif x_after is None:
+        # The better of two starts: the current positions, or those of a motion without forces.
+        stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
+        energy = jax.vmap(lambda x: value(problem.energies, x, first.energies))
+        of_coast, of_stay = energy(jnp.stack([coast, stay]))
+        start = jnp.where(of_coast < of_stay, coast, stay)
+    else:
+        start = jnp.where(free, state.x + integrator.span * (x_after - state.x), carried)
+    if problem.friction_iterations:
         # Forces averaged along the step take the normal forces at its middle.
         middle = 0.5 if integrator.averaged else 1.0
-        x, outcome, (at_start, data, contact), (_, at_end, contact_at_end) = iterated(
-            solved, lambda x: prepared(state.x + middle * (x - state.x)), start, first, friction_iterations
+        x, outcome, data, at_end = iterated(
+            solved, lambda x: prepared(state.x + middle * (x - state.x)), start, first, problem.friction_iterations
         )
-        change = friction_change(scene, terms, moving, x, (data[1:], contact), (at_end[1:], contact_at_end))
-        return Balanced(x, from_start(outcome, contact), at_start, data, contact, change)
+        change = friction_change(problem.scene, problem.energies, problem.moving, x, data, at_end)
+    else:
+        x, outcome, data, change = *solved(start, first), first, None
+    if problem.friction_iterations or x_after is not None:
+        # The search began elsewhere.
+        there = lists_between(problem.moving, state.x, jnp.zeros_like(state.x), data.moving)
+        outcome = outcome._replace(lists=(there, outcome.lists[1]))
+    return Balanced(x, outcome, data, change)
 
-    def forces(balanced: Balanced) -> Float[Array, "n dim"]:
-        x, outcome, _, data, contact, _ = balanced
-        slope = jax.grad(lambda x: value(energies, x, data))(x)
-        return -slope - moving_gradient(moving, x, outcome.lists[1], contact)[1] if moving else -slope
 
-    def conclude(params: Params, state: State, balanced: Balanced, dt: Any) -> tuple[State, Info]:
-        x, v = integrator.finish(state, balanced.x, dt)
-        # If a contact keeps held vertices from their targets, moving them there would push them through it.
-        x = jnp.where(free, x, balanced.x if moving else state.x + dt * state.v)
-        v = jnp.where(free, v, state.v)
-        info, growth = judged(params, state, x, v, balanced)
-        x, v = trusted((x, v), info.converged)
-        before = Previous(state.x, state.v, jnp.asarray(True)) if integrator.two_steps else None
-        poses = None if state.poses is None else (jnp.asarray(True), params.poses)
-        return State(x, v, before, growth, poses), info
+def forces_on_all(problem: Problem, balanced: Balanced) -> Float[Array, "n dim"]:
+    """Returns the forces of the energies and of inertia on all vertices, in N: zero on free ones."""
+    x, outcome, data, _ = balanced
+    slope = jax.grad(lambda x: value(problem.energies, x, data.energies))(x)
+    return -slope - moving_gradient(problem.moving, x, outcome.lists[1], data.moving)[1] if problem.moving else -slope
 
-    def judged(params: Params, state: State, x: Array, v: Array, solution: Balanced) -> tuple[Info, Growth | None]:
-        # The verdict has no derivatives.
-        params, state, x, v, solution = jax.lax.stop_gradient((params, state, x, v, solution))
-        balanced, outcome, at_start, (_, *data), contact, friction = solution
-        of_stored = tuple(of for _, of in contact) if integrator.averaged else contact
-        work, stored = work_of_held(scene.held, terms, data, balanced, x - state.x), 0.0
-        if moving:
-            lists = jax.tree.map(lambda *leaves: jnp.stack(leaves), *outcome.lists)
-            at_both = jax.vmap(lambda x, lists: moving_gradient(touching, x, lists, of_stored))
-            stored, (_, slope) = at_both(jnp.stack([state.x, x]), lists)
-            if integrator.averaged:
-                slope = moving_gradient(moving, balanced, outcome.lists[1], contact)[1]
-            work += jnp.vdot(slope, jnp.where(free, 0, x - state.x))
-        energies_of_step = energy_balance(
-            scene, params.masses, at_start, (state.x, x), (state.v, v), work, outcome, stored
-        )
-        info = verdict_on_positions(scene, params, x, outcome, of_stored)._replace(friction_change=friction)
-        return with_energies(info, energies_of_step, state.growth)
 
-    return StepParts(init, balance, forces, conclude)
+def conclude(problem: Problem, params: Params, state: State, balanced: Balanced, dt: Any) -> tuple[State, Info]:
+    """Returns the state after the step, and the verdict."""
+    integrator, free = problem.integrator, problem.scene.free
+    x, v = integrator.finish(state, balanced.x, dt)
+    # If a contact keeps held vertices from their targets, moving them there would push them through it.
+    x = jnp.where(free, x, balanced.x if problem.moving else state.x + dt * state.v)
+    v = jnp.where(free, v, state.v)
+    # The verdict has no derivatives.
+    info, growth = _verdict(problem, *jax.lax.stop_gradient((params, state, x, v, balanced)))
+    x, v = trusted((x, v), info.converged)
+    before = Previous(state.x, state.v, jnp.asarray(True)) if integrator.two_steps else None
+    poses = None if state.poses is None else (jnp.asarray(True), params.poses)
+    return State(x, v, before, growth, poses), info
+
+
+def _verdict(
+    problem: Problem, params: Params, state: State, x: Array, v: Array, balanced: Balanced
+) -> tuple[Info, Growth | None]:
+    scene, _, _, (_, *terms), moving, _, _ = problem
+    at_minimum, outcome, data, friction = balanced
+    averages = problem.integrator.averaged
+    of_contacts = tuple(own for _, own in data.moving) if averages else data.moving
+    work = work_of_held(scene.held, terms, data.energies[1:], at_minimum, x - state.x)
+    stored = 0.0
+    if moving:
+        lists = jax.tree.map(lambda *leaves: jnp.stack(leaves), *outcome.lists)
+        touching = contact_energies(scene)
+        at_both = jax.vmap(lambda x, lists: moving_gradient(touching, x, lists, of_contacts))
+        stored, (_, slope) = at_both(jnp.stack([state.x, x]), lists)
+        if averages:
+            slope = moving_gradient(moving, at_minimum, outcome.lists[1], data.moving)[1]
+        work += jnp.vdot(slope, jnp.where(scene.free, 0, x - state.x))
+    balance = energy_balance(scene, params.masses, data.terms, (state.x, x), (state.v, v), work, outcome, stored)
+    info = verdict_on_positions(scene, params, x, outcome, of_contacts)._replace(friction_change=friction)
+    return with_energies(info, balance, state.growth)
 
 
 def _inertia(x: Corners, weight_and_target: tuple[Array, Array]) -> Float[Array, ""]:

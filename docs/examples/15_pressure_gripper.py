@@ -28,11 +28,11 @@ from dln_jax.rollout import rollout
 from dln_jax.softbody.contact.bodies import body_contact
 from dln_jax.softbody.contact.crossings import crossings
 from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
-from dln_jax.softbody.driven import Example, drive, driven_step
 from dln_jax.softbody.mesh.mesh import lumped_masses, make_mesh, values_by_set, vertices_where
 from dln_jax.softbody.mesh.shapes import disc, join, lattice, translate
 from dln_jax.softbody.mesh.surfaces import enclosed_volume, inner_surface, surface_parts
 from dln_jax.softbody.scene import make_scene, potential
+from dln_jax.softbody.step import Motion, make_step
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.loads import gravity, pressure
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
@@ -104,23 +104,18 @@ def chamber_pressure(t):
 
 
 dt = SECONDS / STEPS
-example = Example(
-    scene,
-    dt,
-    SECONDS,
-    control=chamber_pressure,
-    held_path=lambda t: mesh.vertices[roots] + palm(t)[:, None, None] * np.array([0.0, 1.0]),
-)
-init, step = driven_step(example, dt)
+t = dt * np.arange(1, STEPS + 1)
+lifting = Motion(held=mesh.vertices[roots] + palm(t)[:, None, None] * np.array([0.0, 1.0]))
+init, step = make_step(scene, dt)
 
 
 @jax.jit
-def motion(inputs):
+def motion(*inputs):
     observe = lambda state, info: (state.x, info.converged, info.least_distance)  # noqa: E731
-    return rollout(lambda state, now: step(scene.params, state, now), init(), inputs, observe=observe)[1]
+    return rollout(lambda state, now: step(scene.params, state, *now), init(), inputs, observe=observe)[1]
 
 
-x, converged, distances = map(np.asarray, motion(drive(example, dt, STEPS)))
+x, converged, distances = map(np.asarray, motion(chamber_pressure(t), lifting))
 x = np.concatenate([mesh.vertices[None], x])
 shown = np.round(np.array([0.0, LOWERED, 0.5 * (LOWERED + CLOSED), CLOSED, SECONDS]) / dt).astype(int)
 print(f"{converged.sum()} of {STEPS} steps converged; surfaces came within {1e3 * distances.min():.2f} mm")

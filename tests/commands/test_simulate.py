@@ -1,6 +1,5 @@
 """Scenes of soft bodies do what they promise, their energies add up, and the command line."""
 
-import functools
 import os
 import re
 import sys
@@ -15,23 +14,26 @@ from dln_jax.commands import simulate
 from dln_jax.commands.simulations import motion
 from dln_jax.metrics.soft_body_energies import motion_energies
 from dln_jax.rollout import rollout
-from dln_jax.softbody.driven import drive, driven_step
-from dln_jax.softbody.examples import beam, drop
-from dln_jax.softbody.integrators import BACKWARD_EULER
+from dln_jax.softbody.examples import beam, drop, inputs
 from dln_jax.softbody.mesh.shapes import beam as beam_mesh
 from dln_jax.softbody.scene import potential
+from dln_jax.softbody.step import make_step
 from dln_jax.softbody.verdict import Info
 
 
 def played(example, dt, steps):
     """x, v [T, n, dim] after each step, which have all converged."""
-    init, step = driven_step(example, dt, BACKWARD_EULER)
-    params, driven = example.scene.params, drive(example, dt, steps)
+    init, step = make_step(example.scene, dt)
+    params, driven = example.scene.params, inputs(example, dt, steps)
 
     def observe(state, info):
         return state.x, state.v, info.converged
 
-    x, v, converged = jax.jit(lambda: rollout(functools.partial(step, params), init(), driven, observe=observe)[1])()
+    def motion():
+        advance = lambda state, now: step(params, state, *now)  # noqa: E731
+        return rollout(advance, init(v=example.v), driven, steps=steps, observe=observe)[1]
+
+    x, v, converged = jax.jit(motion)()
     assert converged.all()
     return np.asarray(x), np.asarray(v)
 

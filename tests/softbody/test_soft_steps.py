@@ -19,7 +19,7 @@ from dln_jax.softbody.integrators import BDF2, INTEGRATORS, MIDPOINT
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import beam, join, lattice, quadratic, translate
 from dln_jax.softbody.scene import make_scene, with_parameters
-from dln_jax.softbody.step import make_step
+from dln_jax.softbody.step import Motion, make_step
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.fibres import fibres
 from dln_jax.softbody.terms.loads import gravity
@@ -59,6 +59,12 @@ def test_held_vertices_move_with_their_velocity_and_their_work_is_not_growth():
     t = DT * np.arange(1, 21)
     np.testing.assert_allclose(states.x[:, :2], MESH.vertices[:2] + t[:, None, None] * v[:2], atol=1e-13)
     np.testing.assert_array_equal(states.v[:, :2], np.broadcast_to(v[:2], (20, 2, 2)))
+    _, step = make_step(held_body(), DT, MIDPOINT)
+    state = jax.tree.map(lambda of: of[0], states)
+    moved, _ = step(held_body().params, state._replace(v=state.v.at[:2].set(0)), None, Motion(held=states.x[1, :2]))
+    np.testing.assert_allclose(moved.x, states.x[1], atol=1e-13)
+    with one_line(r"expected \(2, 2\)"):
+        step(held_body().params, state, None, Motion(held=states.x[1]))
     assert info.energy_at_hand.max() > 100.0 and (abs(info.energy_growth) < 0.05 * info.energy_at_hand).all()
 
 

@@ -21,7 +21,7 @@ from dln_jax.rollout import rollout
 from dln_jax.runs.progress import progress
 from dln_jax.runs.report import png
 from dln_jax.softbody.contact.crossings import count_overlaps
-from dln_jax.softbody.driven import Example, drive
+from dln_jax.softbody.examples import Example, inputs
 from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.mesh.simplices import volume_ratios
 from dln_jax.softbody.scene import Params, State
@@ -70,20 +70,25 @@ def run_motion(prepared: PreparedScene, precision: Any) -> SimulatedMotion:
     _, example, (init, step), dt, steps, _ = prepared
     count = max(1, steps // CHUNKS)
     params = example.scene.params
-    start = state = in_precision(init(), precision)
+    start = state = in_precision(init(v=example.v), precision)
+    at = functools.partial(inputs, example, dt, count)
 
     def advance(state: State, params: Params, driven: Any) -> tuple[State, Any]:
         return rollout(
-            functools.partial(step, params), state, driven, observe=lambda state, info: (state.x, state.v, info)
+            lambda state, now: step(params, state, *now),
+            state,
+            driven,
+            steps=count,
+            observe=lambda state, info: (state.x, state.v, info),
         )
 
     with progress(steps) as show:
         began = time.perf_counter()
-        program = jax.jit(advance).lower(state, params, drive(example, dt, count)).compile()
+        program = jax.jit(advance).lower(state, params, at()).compile()
         compiled = time.perf_counter() - began
         seen, spent, done = [], 0.0, 0
         while done < steps:
-            driven = drive(example, dt, count, first=done)
+            driven = at(first=done)
             began = time.perf_counter()
             state, chunk = jax.block_until_ready(program(state, params, driven))
             spent += time.perf_counter() - began
@@ -92,8 +97,8 @@ def run_motion(prepared: PreparedScene, precision: Any) -> SimulatedMotion:
             show(min(done, steps), f"t = {min(done, steps) * dt:.2f} s")
     x, v, info = jax.tree.map(lambda *chunks: np.concatenate(chunks)[:steps], *seen)
     x, v = (np.concatenate([np.asarray(first)[None], rest]) for first, rest in ((start.x, x), (start.v, v)))
-    count = None if example.scene.contacts else count_overlaps(example.scene.mesh)
-    overlaps = None if count is None else np.array([count(at) for at in x[1:]])
+    overlapping = None if example.scene.contacts else count_overlaps(example.scene.mesh)
+    overlaps = None if overlapping is None else np.array([overlapping(at) for at in x[1:]])
     return SimulatedMotion(dt * np.arange(steps + 1), x, v, info, compiled, done / spent, overlaps)
 
 
@@ -175,7 +180,7 @@ def figures_of(
     """Functions that draw the energies, the moments and the GIF, up to the first moment that is not finite."""
     shown = slice(motion.finite)
     t, x, v, params = motion.t[shown], motion.x[shown], motion.v[shown], example.scene.params
-    control = drive(example, float(t[1]), max(len(t) - 1, 1)).control
+    control, _ = inputs(example, float(t[1]), max(len(t) - 1, 1))
     if control is not None:
         # The start is shown with the actuation of the first step.
         control = jnp.concatenate([control[:1], control])[shown]

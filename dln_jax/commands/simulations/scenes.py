@@ -13,13 +13,12 @@ from dln_jax.data import meshes
 from dln_jax.errors import require_memory, require_within
 from dln_jax.precision import data_type
 from dln_jax.runs.arguments import names_listed, numbers_of, pairs_of, refuse_given
-from dln_jax.softbody.driven import Example, driven_step
-from dln_jax.softbody.examples import EXAMPLES
+from dln_jax.softbody.examples import EXAMPLES, Example
 from dln_jax.softbody.integrators import INTEGRATORS
 from dln_jax.softbody.mesh.files import require_meshio
 from dln_jax.softbody.mesh.mesh import Mesh, components, overlaps, values_by_set, vertices_in
 from dln_jax.softbody.mesh.surfaces import facet_points, facets_in, inner_surface
-from dln_jax.softbody.step import Stepper
+from dln_jax.softbody.step import Stepper, make_step
 from dln_jax.softbody.terms.loads import point_force, pressure, traction
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.softbody.terms.term import Term
@@ -89,7 +88,7 @@ def prepare(options: Arguments, name: str) -> PreparedScene:
     require_within({"steps (--seconds / --dt)": steps})
     # Positions and velocities of every step in float64, held twice while chunks are concatenated.
     require_memory(f"a motion of {steps:,} steps", 32.0 * steps * example.scene.mesh.vertices.size)
-    stepper = driven_step(example, dt, INTEGRATORS[options.integrator])
+    stepper = make_step(example.scene, dt, INTEGRATORS[options.integrator])
     return PreparedScene(name, example, stepper, dt, steps, statements)
 
 

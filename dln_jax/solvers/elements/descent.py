@@ -7,7 +7,7 @@ those of moving elements first: always projecting costs several times the iterat
 times on bodies that are pressed together. Moving elements also limit the steps.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +16,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.solvers.elements.assembly import Pattern, entries, value_and_gradient
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, element_hessians, project, square
-from dln_jax.solvers.elements.line_search import Evaluated, line_search
 from dln_jax.solvers.elements.linear_solvers import LinearSolver, summed_products
 from dln_jax.solvers.elements.moving import (
     Lists,
@@ -37,6 +36,9 @@ _ROUNDING_UNITS = 16
 # Shifts of the projected Hessian's diagonal, relative to the largest diagonal entry of an element, tried in turn: even
 # projected elements may add up to a singular matrix. They change the search directions, not the minimum.
 _SHIFTS = (1e-6, 1e-3, 1.0)
+# Sufficient decrease of the line search (Armijo), and how often it halves the step.
+_DECREASE = 1e-4
+_HALVINGS = 40
 # How often a step whose list of elements overflows is shortened, eightfold.
 _SHORTENINGS = 6
 
@@ -48,6 +50,14 @@ class Sum(NamedTuple):
     at: Pattern
     solver: LinearSolver
     moving: tuple[MovingEnergy, ...] = ()
+
+
+class Evaluated(NamedTuple):
+    """A point with its energy and gradient."""
+
+    x: Blocks
+    energy: Float[Array, ""]
+    gradient: Blocks
 
 
 class _MinimumIterate(NamedTuple):
@@ -112,7 +122,7 @@ def descend(
         def evaluate(x: Blocks) -> tuple[Array, Blocks]:
             return sum_and_gradient(total, x, data, lists)
 
-        point, length = line_search(
+        point, length = _line_search(
             evaluate, state.point, direction, slope, unclear, scale, longest=limit, any_change=forced
         )
         gap = None if state.gap is None else (1 - length) * state.gap
@@ -229,3 +239,54 @@ def sum_and_gradient(total: Sum, x: Blocks, data: Any, lists: Lists) -> tuple[Ar
         return energy, slope
     more, moving_slope = moving_gradient(total.moving, x, lists, data[1])
     return energy + more, slope + jnp.where(total.at.free, moving_slope, 0)
+
+
+def _line_search(
+    evaluate: Callable[[Blocks], tuple[Float[Array, ""], Blocks]],
+    start: Evaluated,
+    direction: Blocks,
+    slope: Float[Array, ""],
+    unclear: Float[Array, ""],
+    scale: Float[Array, "n 1"],
+    *,
+    longest: Float[Array, ""] | float = 1.0,
+    any_change: Bool[Array, ""] | bool = False,
+) -> tuple[Evaluated, Float[Array, ""]]:
+    """Takes the first of the steps l, l/2, l/4, ... that lowers the energy, or the gradient if rounding hides that.
+
+    Changes of the energy below `unclear` are rounding of terms that cancel at rest; the gradient of a stiff body keeps
+    improving by many digits beyond that. Returns point and step length, or the start and 0 if no step is accepted.
+
+    Args:
+        evaluate: x -> energy and gradient.
+        start: the point where the search starts.
+        direction: a descent direction.
+        slope: derivative of the energy along the direction, <= 0.
+        unclear: size of energy changes that rounding hides.
+        scale: unit of the gradient's rows.
+        longest: the first length l.
+        any_change: whether to accept any step to a finite energy.
+    """
+
+    def size(gradient: Blocks) -> Array:
+        return jnp.max(jnp.abs(gradient) / scale, initial=0)
+
+    before = size(start.gradient)
+
+    def attempt(trial: tuple[Evaluated, Array, Array]) -> tuple[Evaluated, Array, Array]:
+        _, length, _ = trial
+        x = start.x + length * direction
+        energy, gradient = evaluate(x)
+        change = energy - start.energy
+        lower = change <= _DECREASE * length * slope
+        flatter = (jnp.abs(change) <= unclear) & (size(gradient) < before)
+        accepted = (lower | flatter | any_change) & jnp.isfinite(energy) & jnp.isfinite(gradient).all()
+        return Evaluated(x, energy, gradient), length / 2, accepted
+
+    first = jnp.asarray(longest, start.x.dtype)
+    smallest = 2.0**-_HALVINGS * first
+    last, length, accepted = jax.lax.while_loop(
+        lambda trial: ~trial[2] & (trial[1] > smallest), attempt, (start, first, jnp.asarray(False))
+    )
+    kept = [jnp.where(accepted, new, old) for new, old in zip(last, start, strict=True)]
+    return Evaluated(*kept), jnp.where(accepted, 2 * length, 0)

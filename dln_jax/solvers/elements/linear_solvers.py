@@ -4,7 +4,7 @@ There are four methods; `selection` chooses one:
 
 - dense Cholesky;
 - block-tridiagonal Cholesky after reverse Cuthill-McKee ordering, a `lax.scan` over blocks, for narrow bands;
-- multifrontal Cholesky after nested dissection, for wide bands;
+- Cholesky by tiles after nested dissection, for wide bands;
 - matrix-free conjugate gradients with a block-Jacobi preconditioner on the element Hessians.
 
 If the matrix is not positive definite, the solution is not finite: there are no shifts and no clamping.
@@ -20,14 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from dln_jax.solvers.elements import multifrontal
+from dln_jax.solvers.elements import sparse_cholesky
 from dln_jax.solvers.elements.assembly import Pattern, assemble
-from dln_jax.solvers.elements.dissection import Node, dissect
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, square
-from dln_jax.solvers.elements.fronts import Plan, plan
 from dln_jax.solvers.elements.symmetric_systems import (
     conjugate_gradients,
     factorise_blocks,
@@ -42,13 +40,9 @@ from dln_jax.solvers.lapack import cholesky, shared_or_batched, substitute
 # one; measured with 56 to 120 unknowns, bands of 11 to 40 and 2 to 64 systems: 4 times at 56, 11 and 64.
 _WIDEST_BAND = 20
 _LOWER_BANDS = 4
-# Parts of the body with fewer unknowns are not dissected; and rows of a tile. They are the fastest of 48 to 96 and of
-# 96 to 192 on bodies of 800 to 20,000 unknowns.
-_LEAF_UNKNOWNS = 128
-TILE = 64
 # Relative residuals of the conjugate gradients, and their largest number of products.
 _SOLVE_RESIDUAL = 1e-10
-SEARCH_RESIDUAL = 1e-2
+_SEARCH_RESIDUAL = 1e-2
 _UPPER_PRODUCTS = 10_000
 
 
@@ -143,45 +137,26 @@ def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     return LinearSolver(factorise, solve, solve)
 
 
-def sparse(_: Sequence[ElementEnergy], at: Pattern, *, tables: Plan | None = None) -> LinearSolver:
-    """Factorises by multifrontal Cholesky; pass `tables` if `elimination_plan` is already computed.
+def sparse(_: Sequence[ElementEnergy], at: Pattern, *, tables: sparse_cholesky.Plan | None = None) -> LinearSolver:
+    """Factorises by tiles after nested dissection; pass `tables` if the plan is already computed.
 
     The factor also serves as a preconditioner for similar matrices: `solve` takes any right-hand side.
     """
-    tables = elimination_plan(at) if tables is None else tables
+    tables = sparse_cholesky.plan(at) if tables is None else tables
 
-    def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> multifrontal.Tiles:
-        return multifrontal.factorise(tables, values)
+    def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> sparse_cholesky.Tiles:
+        return sparse_cholesky.factorise(tables, values)
 
-    def solve(factor: multifrontal.Tiles, b: Blocks) -> Blocks:
-        return multifrontal.solve(tables, factor, b.reshape(-1)).reshape(b.shape)
+    def solve(factor: sparse_cholesky.Tiles, b: Blocks) -> Blocks:
+        return sparse_cholesky.solve(tables, factor, b.reshape(-1)).reshape(b.shape)
 
     return LinearSolver(factorise, solve, solve)
 
 
-def elimination_plan(at: Pattern) -> Plan:
-    """Returns the tables of a multifrontal factorisation of the free unknowns, ordered by nested dissection."""
-    row, column = at.rows // at.width, at.columns // at.width
-    coupled = csr_array(coo_array((np.ones(len(row)), (row, column)), shape=(at.blocks, at.blocks)))
-    graph = csr_array(coupled + coupled.T)
-    graph.setdiag(0)
-    graph.eliminate_zeros()
-    graph.data[:] = 1
-    solved = np.flatnonzero(at.free.any(axis=1))
-    numbers = np.arange(at.unknowns).reshape(at.blocks, at.width)
-
-    def unknowns(vertices: np.ndarray) -> np.ndarray:
-        return numbers[solved[vertices]][at.free[solved[vertices]]]
-
-    nodes = dissect(graph[solved][:, solved], max(1, _LEAF_UNKNOWNS // at.width))
-    nodes = [Node(unknowns(node.own), unknowns(node.boundary), node.children) for node in nodes]
-    return plan(nodes, at.rows, at.columns, at.unknowns, TILE)
-
-
-def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
+def matrix_free(energies: Sequence[ElementEnergy], at: Pattern, *, products: int = _UPPER_PRODUCTS) -> LinearSolver:
     """Solves by conjugate gradients with a block-Jacobi preconditioner, on products with the element Hessians.
 
-    A solution that misses its relative residual is not finite.
+    A solution that misses its relative residual after `products` products is not finite.
     """
     n, b = at.blocks, at.width
     numbers = np.arange(n * b).reshape(n, b)
@@ -201,9 +176,9 @@ def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
             return (inverse @ x[..., None])[..., 0]
 
         right = jnp.where(at.free, right, 0)
-        return conjugate_gradients(product, right, precondition, tolerance=tolerance, iterations=_UPPER_PRODUCTS)
+        return conjugate_gradients(product, right, precondition, tolerance=tolerance, iterations=products)
 
-    return LinearSolver(factorise, partial(run, _SOLVE_RESIDUAL), partial(run, SEARCH_RESIDUAL))
+    return LinearSolver(factorise, partial(run, _SOLVE_RESIDUAL), partial(run, _SEARCH_RESIDUAL))
 
 
 def summed_products(

@@ -16,7 +16,7 @@ from dln_jax.softbody.integrators import AVERAGE_VECTOR_FIELD, BACKWARD_EULER
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import beam, disc
 from dln_jax.softbody.scene import contact_energies, make_scene, potential, prepare_contacts, with_parameters
-from dln_jax.softbody.step import make_step
+from dln_jax.softbody.step import Motion, make_step
 from dln_jax.softbody.terms.contact import motion_of, plane_contact
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.loads import gravity
@@ -138,11 +138,9 @@ def test_derivatives_through_iterated_friction_with_a_moving_obstacle_agree_with
     """They are those of the iterations that were taken, hence exact before the forces have stopped changing, too."""
     scene = on_ground()
     init, step = make_step(scene, DT, AVERAGE_VECTOR_FIELD, tolerance=1e-11, friction_iterations=2)
-    ground = scene.params.terms["ground"]
 
     def outcome(values):
-        shape = ground.shape._replace(offset=values[3])
-        moved = {"stiffness": values[1], "friction": values[2], "shape": shape}
+        moved = {"stiffness": values[1], "friction": values[2], "offset": values[3]}
         params = with_parameters(scene.params, elastic={"youngs_modulus": values[0]}, ground=moved)
         state, info = jax.lax.scan(lambda state, _: step(params, state), init(v=[2.0, -1.0]), None, length=6)
         return jnp.sum(state.x[:, 0] ** 2) + jnp.sum(state.v[:, 1]), info.converged
@@ -175,22 +173,15 @@ BELT_SPEED, BELT_FRICTION, BELT_DT, STEPS = 0.5, 0.8, 5e-3, 40
 NEAR = {"distance": 5e-3, "stiffness": 1e4, "friction": BELT_FRICTION, "name": "belt"}
 
 
-def with_belt(params, **shape):
-    """Parameters with another shape of the belt: an obstacle, or a plane."""
-    belt = params.terms["belt"]
-    belt = belt._replace(shape=belt.shape._replace(**shape)) if hasattr(belt, "shape") else belt._replace(**shape)
-    return params._replace(terms={**params.terms, "belt": belt})
-
-
-def carried(stepper, params_at, **start):
-    """The last state, and the mean velocity in x and convergence of every step, with parameters at its end."""
-    init, step = stepper
+def carried(scene, dt, belt_at, integrator=BACKWARD_EULER, *, start=None, **settings):
+    """The last state, and the mean velocity in x and convergence of every step, with the belt's place at its end."""
+    init, step = make_step(scene, dt, integrator, **settings)
 
     def one(state, number):
-        state, info = step(params_at(number), state)
+        state, info = step(scene.params, state, None, Motion(surfaces={"belt": belt_at(number)}))
         return state, (state.v[:, 0].mean(), info.converged)
 
-    return jax.lax.scan(one, init(**start), jnp.arange(STEPS))
+    return jax.lax.scan(one, init(*start or ()), jnp.arange(STEPS))
 
 
 @pytest.fixture(scope="module")
@@ -204,8 +195,8 @@ def travelled():
     scene = scene_of(mesh, contacts=[obstacle_contact(mesh, box([0.0, -0.05], [2.0, 0.05]), **NEAR)])
 
     def run(speed, integrator=BACKWARD_EULER, **settings):
-        at = lambda number: with_belt(scene.params, centre=jnp.stack([speed * BELT_DT * number, -0.05]))  # noqa: E731
-        state, seen = carried(make_step(scene, BELT_DT, integrator, **settings), at)
+        at = lambda number: {"centre": jnp.stack([speed * BELT_DT * number, -0.05])}  # noqa: E731
+        state, seen = carried(scene, BELT_DT, at, integrator, **settings)
         return state.x[:, 0].mean(), seen
 
     return run
@@ -236,8 +227,8 @@ def test_damping_takes_the_velocity_of_a_plane():
     def motion(rise, v):
         # The first step takes the plane to be at rest, before it touches the body.
         start = jnp.stack([0.0, v])
-        at = lambda number: with_belt(scene.params, offset=rise * 1e-3 * number)  # noqa: E731
-        return carried(make_step(scene, 1e-3), at, x=mesh.vertices - 1e-3 * start, v=start)[0].v
+        at = lambda number: {"offset": rise * 1e-3 * number}  # noqa: E731
+        return carried(scene, 1e-3, at, start=(mesh.vertices - 1e-3 * start, start))[0].v
 
     rising, falling = jax.jit(lambda: jax.lax.map(lambda case: motion(*case), jnp.array([[1.0, 0.0], [0.0, -1.0]])))()
     np.testing.assert_allclose(rising - falling, np.broadcast_to([0.0, 1.0], (6, 2)), atol=1e-6)

@@ -1,4 +1,4 @@
-"""The sparse factorisation against SciPy's, and the elimination order against what is known of grids."""
+"""The sparse factorisation against SciPy's."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,6 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import Delaunay
 
 from dln_jax.solvers.elements.assembly import Pattern, pattern
-from dln_jax.solvers.elements.dissection import bisect
 from dln_jax.solvers.elements.energies import ElementEnergy
 from dln_jax.solvers.elements.linear_solvers import sparse
 
@@ -88,11 +87,3 @@ def test_a_matrix_that_is_not_definite_has_no_finite_solution():
         values[lane, on_diagonal[place]] *= -1
     x = jax.jit(jax.vmap(lambda values, b: solution(at, values, b)))(values, b)
     assert np.isfinite(x).all(axis=(1, 2)).tolist() == [False, False, False, True]
-
-
-def test_the_separator_of_a_box_is_its_cross_section():
-    pairs = grid(20, 6, 5)
-    both = np.concatenate([pairs, pairs[:, ::-1]])
-    left, right, separator = bisect(csr_array(coo_array((np.ones(len(both)), both.T), shape=(600, 600))))
-    assert len(separator) == 30 and min(len(left), len(right)) >= 0.3 * 600
-    assert sorted(np.concatenate([left, right, separator])) == list(range(600))
