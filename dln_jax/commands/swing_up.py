@@ -3,9 +3,9 @@
 The plant is an MJCF or URDF file: a cart-pole, a rotary pendulum, an acrobot, a pendubot, or another chain with a
 passive joint; cart-pole and rotary-pendulum name two files of the library, desktop plants with dry friction. MuJoCo
 simulates it, with encoders and torques that act a sample late. It is explored without a model; only q and the commanded
-torques are recorded. Models: identified (rigid bodies, linear in its parameters), delan (a structured deep Lagrangian network
-with friction), known (the file's bodies and friction), analytic (the same without friction). Trials of the model choose
-all gains, and the law gets its states from a Kalman filter of the model.
+torques are recorded. Models: identified (rigid bodies, linear in its parameters), delan (a structured deep Lagrangian
+network with friction), known (the file's bodies and friction), analytic (the same without friction). Trials of the
+model choose all gains, and the law gets its states from a Kalman filter of the model.
 
 A run folder gets data.npz, the model, law.json, metrics.json, config.json, and a figure of the runs.
 """
