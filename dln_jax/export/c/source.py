@@ -161,7 +161,7 @@ def _traced(key: str, function: Function, examples: Any, precision: str) -> tupl
 
     def shape_of(leaf):
         dtype = PRECISIONS[precision][0] if kind_of(_dtype(leaf)) == "real" else _dtype(leaf)
-        return jax.ShapeDtypeStruct(np.shape(leaf), dtype)
+        return jax.ShapeDtypeStruct(np.shape(leaf), jax.dtypes.canonicalize_dtype(dtype))
 
     try:
         examples = jax.tree.map(shape_of, examples)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dln_jax.commands.values import plants
-from dln_jax.control.optimal.own_plants import FILES
+from dln_jax.control.optimal.own_plants import FOLDER
 from dln_jax.control.optimal.problem import rates
 from dln_jax.zoo.value_functions import plant_of_model
 from scripts.reports.control.published import PLANTS, evaluate, starts
@@ -38,7 +38,7 @@ def test_the_cart_pole_as_printed():
 @pytest.mark.parametrize("name", PLANTS)
 def test_files_have_the_published_dynamics(name):
     pytest.importorskip("mujoco", reason="MuJoCo reads the files; it is in the extra [robot]")
-    run, known, _ = plants.of_file(FILES[name])
+    run, known, _ = plants.of_file(FOLDER / f"{name}.xml")
     of_file = plant_of_model(run.model, run.parameters, plants.problem_of(run, known))
     x, u = jnp.array([0.3, 2.0, -1.5, 4.0])[-2 * len(known.joints) :], 0.7 * known.limits.control[:, 1]
     published = PLANTS[name]()
