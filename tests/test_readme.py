@@ -54,7 +54,9 @@ def blocks(language):
 
 def commands(text):
     """The commands of a shell block, each as a list of words; `dln-jax NAME` is `python -m scripts.NAME`."""
-    lines = re.sub(r"^dln-jax (\w)", r"python -m scripts.\1", text.replace("\\\n", " "), flags=re.MULTILINE).splitlines()
+    lines = re.sub(
+        r"^dln-jax (\w)", r"python -m scripts.\1", text.replace("\\\n", " "), flags=re.MULTILINE
+    ).splitlines()
     return [shlex.split(part, comments=True) for line in lines for part in line.split("&&") if part.strip()]
 
 
