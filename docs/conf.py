@@ -11,6 +11,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 from docutils import nodes
+from latex2mathml.converter import convert
 from matplotlib.figure import Figure
 from sphinx.ext.napoleon import Config, GoogleDocstring
 from sphinx_gallery.scrapers import figure_rst
@@ -26,7 +27,6 @@ version = release = dln_jax.__version__
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
-    "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "sphinx_gallery.gen_gallery",
@@ -49,6 +49,7 @@ autodoc_typehints_format = "short"
 python_use_unqualified_type_names = True
 
 html_theme = "furo"
+html_math_renderer = "mathml"
 html_title = f"dln_jax {version}"
 html_static_path = ["_static"]
 html_css_files = ["style.css"]
@@ -243,8 +244,19 @@ def ancestors(node):
         yield node
 
 
+def write_mathml(display):
+    """A visitor that writes a formula as MathML, which browsers draw without a script and so without a network."""
+
+    def visit(writer, node):
+        writer.body.append(convert(node.astext(), display=display))
+        raise nodes.SkipNode
+
+    return visit
+
+
 def setup(app):
     """Sphinx calls it."""
+    app.add_html_math_renderer("mathml", (write_mathml("inline"), None), (write_mathml("block"), None))
     write_public_page()
     write_api_pages()
     app.connect("autodoc-process-docstring", to_rst, priority=100)

@@ -53,8 +53,10 @@ def blocks(language):
 
 
 def commands(text):
-    """The commands of a shell block, each as a list of words."""
-    lines = text.replace("\\\n", " ").splitlines()
+    """The commands of a shell block, each as a list of words; `dln-jax NAME` is `python -m scripts.NAME`."""
+    lines = re.sub(
+        r"^dln-jax (\w)", r"python -m scripts.\1", text.replace("\\\n", " "), flags=re.MULTILINE
+    ).splitlines()
     return [shlex.split(part, comments=True) for line in lines for part in line.split("&&") if part.strip()]
 
 
@@ -74,9 +76,9 @@ EVERY = [words for block in blocks("bash") for words in commands(block.text)]
 FIRST = ["python", "-m", "scripts.train_delan"]
 SCRIPTS = [list(words) for words in dict.fromkeys(map(tuple, EVERY)) if words[2:3] and words[2].startswith("scripts.")]
 INLINE = {
-    text.replace("\n", " ")
+    re.sub(r"^dln-jax ", "python -m scripts.", text.replace("\n", " "))
     for page in PROSE.values()
-    for text in re.findall(r"`(python -m scripts\.(?!report --)[^`]*)`", page)
+    for text in re.findall(r"`((?:python -m scripts\.(?!report --|NAME)|dln-jax [a-z_]+ --)[^`]*)`", page)
 }
 
 

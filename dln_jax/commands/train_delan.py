@@ -48,8 +48,8 @@ class Plant(Drawn, Resumable, Filtered):
     scene: Unstated[SceneName] = None
     """Textbook scene that states the needs, such as chain-3; sampled without data."""
     needs: Unstated[str] = None
-    """Joints and terms, such as '{"joints": ["revolute"], "friction": true}' (default: the scene's or file's, else
-    revolute, gravity, friction)."""
+    """Joints and terms, such as 'rp friction' for a revolute and a prismatic joint, or as JSON (default: the scene's or
+    file's, else revolute, gravity, friction)."""
     seed: int = 0
     """Seed of parameters, shuffling and validation."""
     uncertainty: bool = True

@@ -87,8 +87,8 @@ class Recorded(Checked):
     data: Unstated[Path] = None
     """Trajectories as npz, CSV or ROS bag."""
     needs: Unstated[str] = None
-    """Joints and terms of the plant, such as '{"joints": ["revolute"], "friction": true}' (default: those of the file,
-    else revolute joints, a potential and friction)."""
+    """Joints and terms of the plant, such as 'rr friction', or as JSON (default: those of the file, else revolute
+    joints, a potential and friction)."""
     test: Unstated[str] = None
     """Test trajectories: labels, an npz file, last:30% for the end of every trajectory, or blocks, for ten blocks of
     time in each (default: every sixth, or the last fifth)."""

@@ -4,6 +4,7 @@ import dataclasses
 import difflib
 import itertools
 import math
+import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args
@@ -267,10 +268,23 @@ def cutoff(text: str | None) -> Any:
 
 
 def needs_of(text: str | None) -> "Needs | None":
-    """Parses --needs; `InputError` if the text does not state valid needs."""
-    from dln_jax.data.joints import needs_from_text  # imports JAX
+    """Parses --needs: JSON, or in short a letter for each joint and its terms, such as "rp friction no-gravity".
+
+    Raises:
+        InputError: the text does not state valid needs.
+    """
+    from dln_jax.data.joints import needs_from_json, needs_from_text  # imports JAX
 
     try:
-        return None if text is None else needs_from_text(text)
+        if text is None or text.lstrip()[:1] in ("{", "["):
+            return None if text is None else needs_from_text(text)
+        kinds, *terms = text.split() or [""]
+        if not re.fullmatch("[rp]+", kinds):
+            raise InputError(f"needs: {text!r:.40} is neither a letter r or p for each joint with its terms, nor JSON")
+        laws = [term for term in terms if term not in ("friction", "no-gravity")]
+        stated: dict[str, Any] = {"joints": [{"r": "revolute", "p": "prismatic"}[letter] for letter in kinds]}
+        return needs_from_json(
+            stated | {"friction": "friction" in terms, "gravity": "no-gravity" not in terms, "joint_friction": laws}
+        )
     except InputError as error:
         raise InputError(f"--{error}; see --help for an example") from None

@@ -128,7 +128,7 @@ MISTAKES = {
     "--test z": "no trajectory is labelled 'z'",
     "--scene pendulum": "has 1 joints",
     "--scene teapot": "choose from two-link-arm",
-    "--needs revolute": "--needs is not JSON",
+    "--needs revolute": "a letter r or p for each joint",
     "--activation sigmoidal": "tanh",
     "--steps 0": "steps is 0",
     "--width -1": "width is -1",
