@@ -165,13 +165,13 @@ def tried(make: Callable[..., Plant], fit: Fit, options: Any, folder: Path) -> R
 
     exploration, estimator, recover = Exploration(seconds=options.seconds_of_data), options.estimator, options.recover
     try:
-        found = learn_to_swing_up(
+        result = learn_to_swing_up(
             plant, exploration, fit, estimator=estimator, seed=options.seed, recover=recover, say=print, keep=keep
         )
     except InputError as error:
         raise InputError(f"{error}; the recording stays in {recording}" if recording.exists() else str(error)) from None
-    save(folder, *found.fitted)
-    law = found.law
+    save(folder, *result.fitted)
+    law = result.law
     write_json(folder / "law.json", {"way": law.way, **numbers_of(law, layout)})
     seconds = max(SECONDS, 2 * law.seconds + HELD)  # long enough for a second attempt
     push = Push(seconds / 2, np.where(driven, 0.0, options.push)) if options.push else None
@@ -191,7 +191,7 @@ def tried(make: Callable[..., Plant], fit: Fit, options: Any, folder: Path) -> R
         "tuning_trials": float(law.trials),
         "tuning_worked_share": law.worked,
         "tuning_margin": law.margin,
-        "learning_seconds": found.seconds,
+        "learning_seconds": result.seconds,
     }
     level, remedy = "good", ""
     if outcomes.share < 1:

@@ -195,9 +195,9 @@ def by_iteration(
     """
 
     def stored(seed: int, like: Any) -> tuple[Any, list[ValueProgress]] | None:
-        if (found := restore(checkpoint(seed), like)) is None:
+        if (last := restore(checkpoint(seed), like)) is None:
             return None
-        state, history = found
+        state, history = last
         return state, [ValueProgress(at.step, at.loss, at.validation, at.seconds, problem.discount) for at in history]
 
     def keep(seed: int, state: Any, history: list[ValueProgress]) -> None:
