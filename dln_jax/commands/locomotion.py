@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import msgspec
@@ -34,15 +34,6 @@ SHOWN = 3_000_000
 """Seed of the rough ground that is shown."""
 
 
-class StoredPolicy(NamedTuple):
-    """A policy with a task of its creature."""
-
-    task: LocomotionTask
-    policy: Policy
-    parameters: Parameters
-    width: int
-
-
 class _Model(msgspec.Struct):
     name: str
     creature: str
@@ -51,8 +42,8 @@ class _Model(msgspec.Struct):
     settings: dict[str, Any]
 
 
-def load_policy(folder: str | Path, **variation: float | None) -> StoredPolicy:
-    """Loads the policy of a run of `train_locomotion`.
+def load_policy(folder: str | Path, **variation: float | None) -> tuple[LocomotionTask, Policy, Parameters, int]:
+    """Loads the policy of a run of `train_locomotion`: a task of its creature, the policy, parameters and width.
 
     Args:
         variation: fields of `Variation` for the task, instead of those of the training; `None` for the training's.
@@ -75,7 +66,7 @@ def load_policy(folder: str | Path, **variation: float | None) -> StoredPolicy:
     if changed:
         task = make_task(creature, variation=trained._replace(**changed), clock_period=model.clock_period)
     like = jax.eval_shape(policy.init, jax.random.key(0))
-    return StoredPolicy(task, policy, load_tree(folder, MODEL, like), model.settings["width"])
+    return task, policy, load_tree(folder, MODEL, like), model.settings["width"]
 
 
 def judge(trials: Trials, steps: int = STEPS) -> Verdict:

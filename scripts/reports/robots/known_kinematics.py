@@ -167,8 +167,8 @@ def added_terms(*, logs_without: int = 20, logs_with: int = 5) -> Numbers:
             state["temperature"] = np.stack([20 + 25 * (1 - np.exp(-t / 8))] * 2, axis=1)
             tau = np.asarray(program(**state)) + NOISE * random.normal(size=(SAMPLES, 2))
             log = from_arrays({"t": t, "trajectory": np.zeros(SAMPLES, int), "tau": tau, **state})
-            for tried in choose_terms(ARM, log, Terms(PLANT_LAWS), additions)[1]:
-                kept[f"share_keeping_{tried.name}"] += tried.kept / count
+            for name in choose_terms(ARM, log, Terms(PLANT_LAWS), additions)[1]:
+                kept[f"share_keeping_{name}"] += 1 / count
         numbers[f"added-terms/{plant}"] = kept
     return numbers
 
