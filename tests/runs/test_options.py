@@ -11,7 +11,7 @@ from typing import get_args, get_type_hints
 import pytest
 
 from dln_jax.commands import COMMANDS, identify, train_delan, train_diffnet, train_hnn, train_hnn_task, train_value
-from dln_jax.control.optimal.own_plants import FILES
+from dln_jax.control.optimal.own_plants import FOLDER
 from dln_jax.data.functions import PUBLISHED
 from dln_jax.learning.fits.settings import WAYS
 from dln_jax.mechanics.friction import LAWS, USUAL
@@ -74,7 +74,7 @@ def test_names_and_defaults_in_options_are_those_of_the_library():
     assert set(train_hnn_task.GENERATED) == set(PROTOCOLS)
     assert set(train_diffnet.NAMES) == set(PUBLISHED)
     assert set(identify.LAWS) == set(LAWS)
-    assert shown(train_value.TrainingOptions, "plant") == {*FILES, "FILE"}
+    assert shown(train_value.TrainingOptions, "plant") == {*(path.stem for path in FOLDER.glob("*.xml")), "FILE"}
     assert shown(train_diffnet.Arguments, "activation") == set(ALL)
     assert set(get_args(get_type_hints(train_hnn_task.Motion)["model"])) - {"auto"} <= set(CATALOGUE)
     defaults = {field.name: field.default for field in dataclasses.fields(identify.Arguments)}

@@ -203,7 +203,7 @@ def encoders(*, motions: int = 15, unseen: int = 6, parts: int = 3) -> Numbers:
                 "momentum-twice-the-cutoff": (fit_momentum, twice.data),
             }
             for way, (fit, data) in fits.items():
-                torque = torque_of(model, fit(model, data, **TOLERANCES).parameters)
+                torque = torque_of(model, fit(model, data, **TOLERANCES)[0])
                 errors.setdefault(way, []).append(float(error_of(torque, test).mean()))
         for way, values in errors.items():
             numbers[f"encoders/{name}/{way}"] = {"nmse_median": np.median(values), "nmse_worst": np.max(values)}
