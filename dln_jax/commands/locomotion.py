@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dln_jax.figures import style
-from dln_jax.figures.animations import write_gif
 from dln_jax.figures.soft_bodies import soft_body_drawing
 from dln_jax.files import as_type
 from dln_jax.locomotion.gradient import Parameters, Policy, make_policy
@@ -107,4 +106,4 @@ def write_gait(path: Path, task: LocomotionTask, seen: Walk, title: str) -> None
     creature, t = task.creature, task.dt * np.arange(len(x))
     figure, show = soft_body_drawing(creature.mesh, x, muscles=creature.muscles, actuation=actuation, ground=ground)
     frames = range(0, len(x), STRIDE)
-    write_gif(path, figure, show, t, frames=frames, frames_per_second=1 / (STRIDE * task.dt), title=title)
+    style.write_gif(path, figure, show, t, frames=frames, frames_per_second=1 / (STRIDE * task.dt), title=title)

@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 
 from dln_jax.commands.pixels.frames import FRAME_TIME, PIXELS, SIDE, Films, inject_energy
 from dln_jax.figures import style
-from dln_jax.figures.animations import DPI, write_gif
 from dln_jax.models.latent_phase import ImageModel
 
 ONLY_TRUTH, ONLY_MODEL = np.array([0.0, 0.45, 0.7]), np.array([1.0, 0.55, 0.3])
@@ -22,14 +21,14 @@ def write_film(
     """Writes the film that a model predicts, over the truth, as a GIF. White pixels agree; intensities are clipped."""
     true, model = (np.clip(frames, 0, 1).reshape(-1, SIDE, SIDE, 1) for frames in (truth, predicted))
     colours = true * ONLY_TRUTH + model * ONLY_MODEL
-    figure, ((axis,),) = style.figure(width=2.4, height=3.2, dpi=DPI)
+    figure, ((axis,),) = style.figure(width=2.4, height=3.2, dpi=style.FILM_DPI)
     image = axis.imshow(np.zeros((SIDE, SIDE, 3)))
     style.title(axis, name, color=style.colour(name))
     axis.set(xticks=[], yticks=[])
     axis.grid(False)
     figure.supxlabel("white: both  blue: truth only\norange: model only", fontsize=7)
     times = np.arange(len(truth))
-    write_gif(
+    style.write_gif(
         path,
         figure,
         lambda index: image.set_data(colours[index]),
