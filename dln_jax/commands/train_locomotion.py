@@ -79,10 +79,10 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
     )
     from dln_jax.locomotion.task import CLOCK_PERIOD, make_task
     from dln_jax.locomotion.worlds import Variation
+    from dln_jax.runs.devices import mesh_of
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import Report, finish, png, rows_of
-    from dln_jax.runs.scaled import mesh_of
     from dln_jax.scale import device_lines, shares
     from dln_jax.softbody.mesh.shapes import creature_named
     from dln_jax.softbody.terms.creature import TIME_STEP

@@ -23,10 +23,10 @@ from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.problem import Progress
 from dln_jax.precision import with_float64
 from dln_jax.runs.arguments import names_listed, numbers_of, require_positive_if_given
+from dln_jax.runs.devices import mesh_of
 from dln_jax.runs.folder import command_folder
 from dln_jax.runs.progress import progress
 from dln_jax.runs.report import Report, finish, png, rows_of
-from dln_jax.runs.scaled import mesh_of
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import load, save
 from dln_jax.zoo.value_functions import ValueRun, network_of, plant_of_model, save_value
