@@ -16,8 +16,7 @@ from dln_jax.commands.values.plants import file_of, of_file, of_run, problem_of,
 from dln_jax.control.optimal.fitted import Iteration, fit_values
 from dln_jax.control.optimal.own_plants import described, own_settings
 from dln_jax.control.optimal.problem import ControlProblem, Disturbance, from_field, worst_disturbance
-from dln_jax.control.optimal.residual import discounts_down_to, fit_hjb
-from dln_jax.control.optimal.value_networks import ValueFit, ValueNetwork, ValueProgress
+from dln_jax.control.optimal.value_networks import ValueFit, ValueNetwork, ValueProgress, discounts_down_to, fit_hjb
 from dln_jax.files import finite
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.problem import Progress
