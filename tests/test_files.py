@@ -10,7 +10,7 @@ from calls import one_line
 from matplotlib.figure import Figure
 
 from dln_jax.files import cache_folder, matches, read_json, write_figure, write_json, writing
-from dln_jax.runs import compilation_cache
+from dln_jax.runs import devices
 from dln_jax.types import InputError
 
 
@@ -35,7 +35,7 @@ def test_a_user_without_a_home_folder_is_told_and_default_data_need_none(monkeyp
     monkeypatch.setattr(Path, "home", no_home)
     with pytest.raises(InputError, match="no home folder; set XDG_CACHE_HOME"):
         cache_folder()
-    assert compilation_cache.keep(True) == "" or "XDG_CACHE_HOME" in compilation_cache.keep(True)
+    assert devices.keep_programs(True) == "" or "XDG_CACHE_HOME" in devices.keep_programs(True)
     assert generators.default_data(scene_named("pendulum")).degrees_of_freedom == 1
     assert names() == []
 

@@ -13,7 +13,7 @@ import dln_jax
 from dln_jax import errors
 from dln_jax.data import schema
 from dln_jax.errors import memory, require_memory, require_network
-from dln_jax.learning.engine import newton
+from dln_jax.learning.engine.fit import newton_stages
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import Problem, sharing
 from dln_jax.mechanics.trees.description import make_tree
@@ -156,7 +156,7 @@ def equations_of(parameters):
     """Gauss-Newton's stages for so many parameters."""
     score = lambda theta: (jnp.sum(theta), jnp.nan)  # noqa: E731
     problem = Problem(lambda theta, x: theta[:1] * x, jnp.zeros(parameters), (jnp.ones((4, 1)),), score)
-    return newton.stages(problem, GaussNewton(steps=1), sharing(problem, None))
+    return newton_stages(problem, GaussNewton(steps=1), sharing(problem, None))
 
 
 AT_THE_LIMIT = {  # what is asked for, and the bytes that it is estimated to take

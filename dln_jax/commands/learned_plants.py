@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from dln_jax.control.closed_loop import ClosedLoopRun, Hardware, Outcomes, Push
 from dln_jax.control.estimate.tuning import from_log
+from dln_jax.control.observers import estimator_of, require_estimator
 from dln_jax.control.plants import __file__ as plants_package
-from dln_jax.control.plants.estimators import estimator_of, require_estimator
 from dln_jax.control.plants.exploring import Exploration, Explored, explore
 from dln_jax.control.plants.mujoco_plants import mujoco_plant, plant_file
 from dln_jax.control.plants.planned import TrackedPlan

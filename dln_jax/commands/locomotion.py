@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import msgspec
@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dln_jax.figures import style
-from dln_jax.figures.animations import write_gif
 from dln_jax.figures.soft_bodies import soft_body_drawing
 from dln_jax.files import as_type
 from dln_jax.locomotion.gradient import Parameters, Policy, make_policy
@@ -34,15 +33,6 @@ SHOWN = 3_000_000
 """Seed of the rough ground that is shown."""
 
 
-class StoredPolicy(NamedTuple):
-    """A policy with a task of its creature."""
-
-    task: LocomotionTask
-    policy: Policy
-    parameters: Parameters
-    width: int
-
-
 class _Model(msgspec.Struct):
     name: str
     creature: str
@@ -51,8 +41,8 @@ class _Model(msgspec.Struct):
     settings: dict[str, Any]
 
 
-def load_policy(folder: str | Path, **variation: float | None) -> StoredPolicy:
-    """Loads the policy of a run of `train_locomotion`.
+def load_policy(folder: str | Path, **variation: float | None) -> tuple[LocomotionTask, Policy, Parameters, int]:
+    """Loads the policy of a run of `train_locomotion`: a task of its creature, the policy, parameters and width.
 
     Args:
         variation: fields of `Variation` for the task, instead of those of the training; `None` for the training's.
@@ -75,7 +65,7 @@ def load_policy(folder: str | Path, **variation: float | None) -> StoredPolicy:
     if changed:
         task = make_task(creature, variation=trained._replace(**changed), clock_period=model.clock_period)
     like = jax.eval_shape(policy.init, jax.random.key(0))
-    return StoredPolicy(task, policy, load_tree(folder, MODEL, like), model.settings["width"])
+    return task, policy, load_tree(folder, MODEL, like), model.settings["width"]
 
 
 def judge(trials: Trials, steps: int = STEPS) -> Verdict:
@@ -116,4 +106,4 @@ def write_gait(path: Path, task: LocomotionTask, seen: Walk, title: str) -> None
     creature, t = task.creature, task.dt * np.arange(len(x))
     figure, show = soft_body_drawing(creature.mesh, x, muscles=creature.muscles, actuation=actuation, ground=ground)
     frames = range(0, len(x), STRIDE)
-    write_gif(path, figure, show, t, frames=frames, frames_per_second=1 / (STRIDE * task.dt), title=title)
+    style.write_gif(path, figure, show, t, frames=frames, frames_per_second=1 / (STRIDE * task.dt), title=title)

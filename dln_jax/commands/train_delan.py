@@ -153,11 +153,11 @@ def train(options: Options, command: str) -> None:
     from dln_jax.learning.engine.checkpoint import Context
     from dln_jax.learning.fit import with_uncertainty
     from dln_jax.process import deadline
+    from dln_jax.runs.devices import mesh_of
     from dln_jax.runs.evaluation import evaluate
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import finish
-    from dln_jax.runs.scaled import mesh_of
     from dln_jax.types import require_positive
 
     seconds = options.seconds if isinstance(options, Limited) else None

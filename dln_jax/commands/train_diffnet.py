@@ -92,10 +92,10 @@ def main(options: Arguments) -> None:
     from dln_jax.metrics.latency import one_step
     from dln_jax.nn.activations import activation
     from dln_jax.precision import require_float64
+    from dln_jax.runs.devices import mesh_of
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import Report, cost_metrics, finish, number, png, unit_of
-    from dln_jax.runs.scaled import mesh_of
     from dln_jax.scale import device_lines
     from dln_jax.types import require_seed
     from dln_jax.zoo.descriptions import describe

@@ -30,9 +30,8 @@ def main(options: Arguments) -> None:
     import jax
     import numpy as np
 
-    from dln_jax.commands.pixels.figures import injection_figure, write_film
-    from dln_jax.commands.pixels.fit import fit, measure, optimiser
-    from dln_jax.commands.pixels.frames import PIXELS, TRAJECTORIES, judge_films, swinging_rod
+    from dln_jax.commands.pixel_films import PIXELS, TRAJECTORIES, judge_films, swinging_rod
+    from dln_jax.commands.pixels import fit, injection_figure, measure, optimiser, write_film
     from dln_jax.figures.training import OF_LOSSES, training_curve
     from dln_jax.learning.engine.checkpoint import Checkpoint, identity
     from dln_jax.learning.engine.problem import losses

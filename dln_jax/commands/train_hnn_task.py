@@ -186,10 +186,10 @@ def main(options: Options) -> None:
     from dln_jax.learning.engine.optimisers import optimiser_named
     from dln_jax.process import deadline
     from dln_jax.runs.arguments import facts, needs_of, numbers_of, require_positive_if_given
+    from dln_jax.runs.devices import mesh_of
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import finish
-    from dln_jax.runs.scaled import mesh_of
     from dln_jax.types import require_seed
     from dln_jax.zoo.run import save
 

@@ -79,10 +79,10 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
     )
     from dln_jax.locomotion.task import CLOCK_PERIOD, make_task
     from dln_jax.locomotion.worlds import Variation
+    from dln_jax.runs.devices import mesh_of
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import Report, finish, png, rows_of
-    from dln_jax.runs.scaled import mesh_of
     from dln_jax.scale import device_lines, shares
     from dln_jax.softbody.mesh.shapes import creature_named
     from dln_jax.softbody.terms.creature import TIME_STEP
@@ -98,19 +98,21 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
         if not 0 <= getattr(options, name) < math.inf:
             raise InputError(f"--{name} is {getattr(options, name)}; expected 0 or a positive number")
     shares(mesh, lanes, LANES)
-    stored = None if options.stored is None else load_policy(options.stored)
+    clock_period, initial = CLOCK_PERIOD, None
+    if options.stored is not None:
+        trained, _, initial, width = load_policy(options.stored)
+        clock_period = trained.clock_period
+        for name, own in (("creature", trained.creature.name), ("width", width)):
+            if (wanted := getattr(options, name)) != own:
+                raise InputError(f"the policy in {options.stored} has {name} {own}, not {wanted}; give --{name} {own}")
     task = make_task(
         creature_named(options.creature),
         episode=options.episode,
         upright=options.upright,
         speed=options.speed,
         variation=Variation(options.start, options.slope, options.rough, options.push),
-        clock_period=CLOCK_PERIOD if stored is None else stored.task.clock_period,
+        clock_period=clock_period,
     )
-    if stored is not None:
-        for name, own in (("creature", stored.task.creature.name), ("width", stored.width)):
-            if (wanted := getattr(options, name)) != own:
-                raise InputError(f"the policy in {options.stored} has {name} {own}, not {wanted}; give --{name} {own}")
     with command_folder(options, "train_locomotion") as folder:
         size = f"{len(task.creature.mesh.vertices)} vertices, {task.muscle_count} muscles, {task.length:.3g} m long"
         print(f"{task.creature.name}: {size}; episodes of {task.episode} steps of {TIME_STEP} s; f64")
@@ -131,7 +133,7 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
                 steps=steps,
                 until=options.until or math.inf,
                 settings=settings,
-                initial=None if stored is None else stored.parameters,
+                initial=initial,
                 directory=folder,
                 resume=options.resume,
                 mesh=mesh,

@@ -31,13 +31,6 @@ class Regulator(NamedTuple):
     """The cost to go is (x - x0)ᵀ S (x - x0)."""
 
 
-class SampledRegulators(NamedTuple):
-    """Regulators for the steps of a trajectory, and the costs to go at the steps and at the end."""
-
-    K: Float[Array, "N m n"]
-    S: Float[Array, "N+1 n n"]
-
-
 class Region(NamedTuple):
     """Region around a goal where a regulator's cost to go is at most a level."""
 
@@ -98,8 +91,10 @@ def held(A: Any, B: Any, dt: float) -> tuple[np.ndarray, np.ndarray]:
     return system[0], system[1]
 
 
-def time_varying_lqr(F: Any, G: Any, Q: Any, R: Any, S_end: Any) -> SampledRegulators:
+def time_varying_lqr(F: Any, G: Any, Q: Any, R: Any, S_end: Any) -> Regulator:
     """Returns regulators along a trajectory of N steps, by the backward Riccati recursion; pure and differentiable.
+
+    K is [N, m, n], and S is [N + 1, n, n]: at the steps and at the end.
 
     Args:
         F: [N, n, n], of the steps x' = F x + G u.
@@ -121,7 +116,7 @@ def time_varying_lqr(F: Any, G: Any, Q: Any, R: Any, S_end: Any) -> SampledRegul
 
     S_end = jnp.asarray(S_end)
     _, (K, S) = jax.lax.scan(back, S_end, (jnp.asarray(F), jnp.asarray(G), Q, R), reverse=True)
-    return SampledRegulators(K, jnp.concatenate([S, S_end[None]]))
+    return Regulator(K, jnp.concatenate([S, S_end[None]]))
 
 
 def regulated(regulator: Regulator, goal: Any, controls: Any, joints: tuple[JointKind, ...]) -> Law:

@@ -13,7 +13,6 @@ from matplotlib.patches import Circle, Rectangle
 
 from dln_jax.control.closed_loop import ClosedLoopRun
 from dln_jax.figures import style
-from dln_jax.figures.animations import DPI, write_gif
 from dln_jax.types import InputError, JointKind, require_positive
 
 MOST_SHOWN = 30
@@ -190,7 +189,7 @@ def write_closed_loop_gif(
     if not len(t) == len(q) == len(u) > 1 or not np.isfinite(q).all():
         raise InputError(f"there are {len(t)} times, {len(q)} states, {len(u)} controls; expected as many, all finite")
     samples = np.searchsorted(t, np.arange(t[0], t[-1], 1 / frames_per_second) - 1e-9)
-    figure, [[machine, trace]] = style.figure(1, 2, width=6.4, height=2.9, dpi=DPI, width_ratios=[1.5, 1.0])
+    figure, [[machine, trace]] = style.figure(1, 2, width=6.4, height=2.9, dpi=style.FILM_DPI, width_ratios=[1.5, 1.0])
     machine.grid(False)
     show_machine = drawing(machine, q, int(np.searchsorted(t, t[0] + TRACE)))
     trace.plot(t, u, color="0.85", linewidth=1.0, drawstyle="steps-post")
@@ -206,7 +205,7 @@ def write_closed_loop_gif(
         line.set_data(t[: index + 1], u[: index + 1])
         now.set_data([t[index]], [u[index]])
 
-    write_gif(path, figure, show, t, frames=samples.tolist(), frames_per_second=frames_per_second, title=title)
+    style.write_gif(path, figure, show, t, frames=samples.tolist(), frames_per_second=frames_per_second, title=title)
 
 
 def _rod(axis: Axes, tip: np.ndarray, trail: int) -> Callable[[int, np.ndarray], None]:

@@ -8,7 +8,6 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from dln_jax.figures import style
-from dln_jax.figures.animations import DPI, write_gif
 from dln_jax.figures.style import TRUTH
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.types import InputError, require_positive
@@ -130,7 +129,9 @@ def write_motion_gif(
         corners[:] = corners.max()
     models = [name for name in motions if name != TRUTH] or [TRUTH]
     width = min(style.WIDTH, 3.4 * len(models))
-    figure, axes = style.figure(1, len(models), width=width, height=width / len(models) + 0.6, sharey=True, dpi=DPI)
+    figure, axes = style.figure(
+        1, len(models), width=width, height=width / len(models) + 0.6, sharey=True, dpi=style.FILM_DPI
+    )
     lines = []
     for axis, name in zip(axes[0], models, strict=True):
         axis.set(xlim=(-corners[0], corners[0]), ylim=(-corners[1], corners[1]), box_aspect=1)
@@ -149,4 +150,4 @@ def write_motion_gif(
             for artist, first in ((line, max(0, index - tail)), (body, index)):
                 artist.set_data(x[first : index + 1], y[first : index + 1])
 
-    write_gif(path, figure, show, t, frames=range(0, len(t), stride), frames_per_second=frames_per_second)
+    style.write_gif(path, figure, show, t, frames=range(0, len(t), stride), frames_per_second=frames_per_second)

@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from dln_jax.figures import style
-from dln_jax.figures.animations import DPI
 from dln_jax.metrics.soft_body_energies import KINETIC, TOTAL
 from dln_jax.softbody.mesh.mesh import Mesh, boundary
 from dln_jax.types import InputError
@@ -276,7 +275,9 @@ def soft_body_drawing(
         low[1] = min(low[1], below[:, 1].min())
     bottom, top = low[1] - margin, high[1] + margin
     wide, high = np.ptp(ends), top - bottom
-    figure, [[axis]] = style.figure(height=float(np.clip(style.WIDTH * high / wide, 0.9, 5.4)) + 1.2, dpi=DPI)
+    figure, [[axis]] = style.figure(
+        height=float(np.clip(style.WIDTH * high / wide, 0.9, 5.4)) + 1.2, dpi=style.FILM_DPI
+    )
     axis.set(xlim=ends, ylim=(bottom, top), aspect="equal")
     axis.set(xlabel="x, m" if plane else "m", ylabel="y, m" if plane else "m")
     axis.grid(False)

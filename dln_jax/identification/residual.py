@@ -5,7 +5,7 @@ error on validation motions is lower by more than the standard error of the diff
 segments of time assumed to be independent, since neighbouring samples are not.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -34,6 +34,7 @@ CANDIDATES: tuple[Candidate, ...] = (
     (("potential", "dissipation", "inertia"), 8),
     (("potential", "dissipation"), 16),
 )
+Selected = tuple[Model, Parameters, dict[str, Any]]
 
 
 def inner_split(train: Trajectories) -> tuple[Trajectories, Trajectories]:
@@ -42,17 +43,6 @@ def inner_split(train: Trajectories) -> tuple[Trajectories, Trajectories]:
     if len(present) < 2:
         raise InputError("a part to choose by takes two trajectories or blocks to fit; record more motions")
     return trajectories(train, np.setdiff1d(present, present[1::4])), trajectories(train, present[1::4])
-
-
-class ResidualFit(NamedTuple):
-    """The tree with the selected residual network, if any."""
-
-    model: Model
-    """The tree's own model, or the sum."""
-    parameters: Parameters
-    """Parameters of the tree, or `ResidualParameters`."""
-    settings: dict[str, Any]
-    """Keywords of `make_residual`; empty if no network was selected."""
 
 
 def fit_residual(
@@ -64,8 +54,11 @@ def fit_residual(
     *,
     candidates: tuple[Candidate, ...] = CANDIDATES,
     iterations: int = 40,
-) -> ResidualFit:
+) -> Selected:
     """Fits residual networks to the torques unexplained by an identified tree, and selects the smallest sufficient one.
+
+    Returns the sum of both, its `ResidualParameters` and the keywords of `make_residual`; or the tree's own model and
+    parameters and no keywords, if no network was selected.
 
     Args:
         rigid: such as `models.make_rigid_tree`.
@@ -88,7 +81,7 @@ def fit_residual(
             for name, values in magnitudes.items()
         }
 
-        def attempt(candidate: Candidate | None) -> tuple[ResidualFit, Float[np.ndarray, " segments"]]:
+        def attempt(candidate: Candidate | None) -> tuple[Selected, Float[np.ndarray, " segments"]]:
             model, whole, settings = rigid, parameters, {}
             if candidate is not None:
                 terms, width = candidate
@@ -97,6 +90,6 @@ def fit_residual(
                 own = dynamics.problem(frozen(model, parameters), Split(train, validation, validation), SCALED_TORQUE)
                 whole = ResidualParameters(parameters, fit(own, GaussNewton(steps=iterations)).parameters)
             squares = squared_torque_errors(model, whole, validation, scale)
-            return ResidualFit(model, whole, settings), mean_of_segments(validation, np.sum(squares, axis=1))
+            return (model, whole, settings), mean_of_segments(validation, np.sum(squares, axis=1))
 
         return select((None, *candidates), attempt, patience=2)[0].outcome

@@ -15,7 +15,7 @@ Its share is what F(m) explains beyond friction of the joints' own rates, in tha
 import functools
 import itertools
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -101,12 +101,8 @@ def describe_rigid_tree(
         additions["friction by load"] = {"laws": ("load",)}
     if cooling:
         additions["friction by temperature"] = {"cooling": True}
-    terms, tried = choose_terms(tree, train, terms, additions)
-    lines += [
-        f"{term.name}: {'kept' if term.kept else 'left out'}; cross-validation error {term.within:.4g} with it, "
-        f"{term.without:.4g} without"
-        for term in tried
-    ]
+    terms, _, tried = choose_terms(tree, train, terms, additions)
+    lines += tried
     fitted, keywords = None, {"motors": motors, "coupled": terms.coupled, **stated}
     if terms.learned:
         fitted = fit_friction(tree, every(train, -(-len(train.t) // MOST_SAMPLES)), **terms._asdict())
@@ -133,21 +129,13 @@ def is_identifiable(tree: Tree, motors: Rows | None, pair: Pair) -> bool:
     return determinacy(np.asarray(links).reshape(-1, links.shape[2]))[-1] == "alone"
 
 
-class TriedTerm(NamedTuple):
-    """A term and the errors with and without it."""
-
-    name: str
-    without: float
-    """Mean squared error in cross-validation, summed over joints, in units of each torque's variance."""
-    within: float
-    """The same, with the term."""
-    kept: bool
-
-
 def choose_terms(
     tree: Tree, data: Trajectories, terms: Terms, additions: Mapping[str, Mapping[str, Any]]
-) -> tuple[Terms, list[TriedTerm]]:
+) -> tuple[Terms, list[str], list[str]]:
     """Tries additions one after another and keeps those that lower the cross-validation error significantly.
+
+    Returns the terms, the names of the additions kept, and a line on every addition. Errors are mean squares in
+    cross-validation, summed over joints, in units of each torque's variance.
 
     Args:
         additions: what each candidate adds to entries of `terms`, by its name, such as {"laws": ("load",)}.
@@ -156,19 +144,24 @@ def choose_terms(
         InputError: as for `fit_friction`.
     """
     if not additions:
-        return terms, []
+        return terms, [], []
     if len(np.unique(data.trajectory)) < FOLDS:
         data = in_blocks(data, BLOCKS)
     data = every(data, -(-len(data.t) // FEWER_SAMPLES))
-    errors, tried = cross_validate(tree, data, terms), []
+    errors = cross_validate(tree, data, terms)
+    names, lines = [], []
     for name, added in additions.items():
         wider = terms._replace(**{entry: getattr(terms, entry) + more for entry, more in added.items()})
         trial = cross_validate(tree, data, wider)
         kept = significantly_better(trial, errors, margin=MARGIN)
-        tried.append(TriedTerm(name, float(errors.mean()), float(trial.mean()), kept))
+        lines.append(
+            f"{name}: {'kept' if kept else 'left out'}; cross-validation error {trial.mean():.4g} with it, "
+            f"{errors.mean():.4g} without"
+        )
         if kept:
+            names.append(name)
             terms, errors = wider, trial
-    return terms, tried
+    return terms, names, lines
 
 
 def cross_validate(tree: Tree, data: Trajectories, terms: Terms) -> Float[np.ndarray, " segments"]:

@@ -36,6 +36,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model
 from dln_jax.precision import compiled
 from dln_jax.solvers import least_squares
+from dln_jax.solvers.least_squares import LeastSquaresSolution
 from dln_jax.solvers.normal_equations import count
 from dln_jax.types import InputError, JointVector, Vector, require_positive
 
@@ -51,17 +52,6 @@ ROUNDS = 10
 """Largest number of reweighted fits; three to five are usual."""
 SETTLED = 0.01
 """Relative change of the errors' covariance that ends them."""
-
-
-class WeakFit(NamedTuple):
-    """Identified parameters, and how well the data determine them; otherwise as `learning.linear.LinearFit`."""
-
-    parameters: Any
-    """Parameters of the model, in its dtype."""
-    rank: int
-    condition: float
-    errors: Float[np.ndarray, "W d"]
-    """Error of every window's mean torques, N m or N."""
 
 
 class MomentumWindows(NamedTuple):
@@ -83,8 +73,11 @@ def fit_momentum(
     noise: JointVector | None = None,
     reweighted: bool = False,
     **tolerances: Any,
-) -> WeakFit:
+) -> tuple[Any, Float[np.ndarray, "W d"], LeastSquaresSolution]:
     """Fits the momenta of windows by least squares, in float64; qdd is not read.
+
+    Returns the parameters in the model's dtype, the error of every window's mean torques in N m or N, and the solution
+    with its rank and condition.
 
     Args:
         model: linear in its parameters, such as `models.make_rigid_tree` and `models.make_trigonometric`.
@@ -108,7 +101,7 @@ def fit_momentum(
             raise InputError(f"noise is {scale}; expected a positive number for each of {d} joints")
         equations = list(_equations(functools.partial(_columns(model), np.zeros(count(like))), data, window))
 
-    def solve(factor: np.ndarray) -> tuple[least_squares.LeastSquaresSolution, np.ndarray]:
+    def solve(factor: np.ndarray) -> tuple[LeastSquaresSolution, np.ndarray]:
         """Solution and errors [W, d] of equations whose errors have the covariance factor factorᵀ."""
         weighted = (
             (np.linalg.solve(factor, A).reshape(b.size, -1), np.linalg.solve(factor, b[..., None]).ravel())
@@ -129,7 +122,7 @@ def fit_momentum(
         except np.linalg.LinAlgError:
             break  # exact data leave no errors
         solution, errors = solve(factor)
-    return WeakFit(parameters_of(solution.x, like), solution.rank, solution.condition, errors)
+    return parameters_of(solution.x, like), errors, solution
 
 
 def momentum_and_rest(plant: Dynamics, q: Vector, qd: Vector) -> tuple[Vector, Vector]:

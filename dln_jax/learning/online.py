@@ -1,6 +1,7 @@
 """Learning while a robot works: samples accumulate in a replay buffer, and a model is refitted to all of them.
 
-    for visit in learn_online(references, drive, refit, model.init(key), empty_replay(2000, 2)): ...
+    start, replay = model.init(key), empty_replay(2000, 2)
+    for outcome, parameters, replay in learn_online(references, drive, refit, start, replay): ...
 
 A replay has a fixed capacity and its empty places have weight zero, so that all refits of a growing data set share one
 compiled program. A refit minimises
@@ -158,24 +159,16 @@ def _scale(replay: Replay) -> Float[Array, " d"]:
     return jnp.where(deviation > 0, deviation, 1.0)
 
 
-class Visit(NamedTuple):
-    """Result of one reference: the motion under the model before, and the model refitted after it."""
-
-    outcome: Any
-    """First result of `drive`."""
-    parameters: Parameters
-    """Parameters after the refit."""
-    replay: Replay
-
-
 def learn_online(
     references: Iterable[Any],
     drive: Callable[[Parameters, Any], tuple[Any, tuple[Any, Any, Any, Any]]],
     refit: Refit,
     parameters: Parameters,
     replay: Replay,
-) -> Iterator[Visit]:
+) -> Iterator[tuple[Any, Parameters, Replay]]:
     """Alternates driving the robot along a reference and refitting the model to all samples recorded so far.
+
+    Yields the outcome of every reference under the model before, and the parameters and replay after its refit.
 
     Args:
         references: in the order of driving; only `drive` reads them.
@@ -191,4 +184,4 @@ def learn_online(
         if len(recording[0]):
             replay = append_recording(replay, *recording)
             parameters = refit(parameters, replay)
-        yield Visit(outcome, parameters, replay)
+        yield outcome, parameters, replay

@@ -124,7 +124,7 @@ def delay_of_torques(model: Model, recording: Trajectories) -> float:
 
     def errors(delay: int) -> np.ndarray:
         late = smooth(driven_torques(recording, delay=delay), smoothed.cutoff).data
-        return fit_momentum(model, late, noise=unit).errors / unit
+        return fit_momentum(model, late, noise=unit)[1] / unit
 
     of_delays = [errors(whole) for whole in range(MOST_DELAY + 1)]
     episode = cut_momentum_windows(smoothed.data).trajectory
@@ -179,7 +179,7 @@ def prepare(
         candidates.append(PreparedRecording(select(data, rest), select(data, [held_out]), float(delay), cutoff))
 
     def misfit(candidate: PreparedRecording) -> float:
-        plant = dynamics(model.energies(fit_momentum(model, candidate.train).parameters))
+        plant = dynamics(model.energies(fit_momentum(model, candidate.train)[0]))
         return float(jax.jit(lambda: acceleration_misfit(plant, cut_momentum_windows(candidate.validation)))())
 
     return candidates[0] if len(candidates) == 1 else min(candidates, key=misfit)
@@ -220,8 +220,9 @@ def identified(data: Trajectories, needs: Needs) -> FittedPlant:
     """
     description = _trigonometric(needs, chain=False)
     model = build(description)
-    noise = np.sqrt(np.mean(fit_momentum(model, data).errors ** 2, axis=0))
-    return FittedPlant(description, fit_momentum(model, data, noise=noise).parameters)
+    _, errors, _ = fit_momentum(model, data)
+    parameters, _, _ = fit_momentum(model, data, noise=np.sqrt(np.mean(errors**2, axis=0)))
+    return FittedPlant(description, parameters)
 
 
 def identified_chain(prepared: PreparedRecording, needs: Needs) -> FittedPlant:
@@ -248,7 +249,7 @@ def identified_chain(prepared: PreparedRecording, needs: Needs) -> FittedPlant:
             return jnp.linalg.eigvalsh(masses)[:, 0] > 0, acceleration_misfit(plant, held_out)
 
         for reweighted in (False, True):
-            parameters = fit_momentum(model, prepared.train, reweighted=reweighted).parameters
+            parameters, _, _ = fit_momentum(model, prepared.train, reweighted=reweighted)
             definite, misfit = map(np.asarray, judge(parameters))
             share = max(share, float(np.mean(definite)))
             if definite.all() and misfit < least:

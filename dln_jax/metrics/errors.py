@@ -6,7 +6,7 @@ z_p with probability p: 1.96 sd for 95 %. A kinetic energy has a positive defini
 
 from collections.abc import Callable
 from statistics import NormalDist
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -132,21 +132,14 @@ def coverage(error: Any, std: Any, levels: tuple[float, ...] = LEVELS) -> Float[
     return np.array([np.mean(np.abs(error) <= half_width(level) * std, axis=0) for level in levels])
 
 
-class Definiteness(NamedTuple):
-    """Eigenvalue statistics of the mass matrices of several states."""
-
-    smallest_eigenvalue: float
-    """Smallest over all states, in the unit of M; NaN if a matrix is not finite."""
-    share_not_definite: float
-    """Share of states, 0 to 1, whose M is indefinite, singular to rounding, or not finite."""
-    largest_condition_number: float
-    """Largest ratio of the eigenvalues' magnitudes; infinite if M is singular or not finite."""
-
-
 def definiteness(
     dynamics: Dynamics | InverseForward, q: Float[Array | np.ndarray, "N d"], qd: Float[Array | np.ndarray, "N d"]
-) -> Definiteness:
+) -> tuple[float, float, float]:
     """Evaluates the eigenvalues of the mass matrix at N states. It only reports; nothing is repaired.
+
+    Returns the smallest eigenvalue in the unit of M, NaN if a matrix is not finite; the share of states, 0 to 1, whose
+    M is indefinite, singular to rounding, or not finite; and the largest ratio of the eigenvalues' magnitudes, infinite
+    if M is singular or not finite.
 
     An eigenvalue counts as positive if it exceeds d times the rounding unit times the largest magnitude of its matrix.
     A Hamiltonian model has M = H_pp⁻¹, which is not finite where H_pp is singular.
@@ -170,4 +163,4 @@ def definiteness(
     definite = eigenvalues.min(axis=1) > rounding * largest
     regular = smallest > rounding * largest
     conditions = np.divide(largest, smallest, out=np.full_like(largest, np.inf), where=regular)
-    return Definiteness(float(eigenvalues.min()), float(np.mean(~definite)), float(conditions.max()))
+    return (float(eigenvalues.min()), float(np.mean(~definite)), float(conditions.max()))

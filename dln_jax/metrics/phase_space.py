@@ -56,7 +56,7 @@ def field_errors(model: Model, parameters: Parameters, part: PhaseSamples) -> di
 
     return {
         "loss": mean_square(data.qd, column(data, "pd")),
-        "clean_field_mse": mean_square(part.field.qd, part.field.pd),
+        "clean_field_mse": mean_square(part.field.qd, column(part.field, "pd")),
     }
 
 

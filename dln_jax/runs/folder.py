@@ -18,7 +18,7 @@ from dln_jax.errors import InputError
 from dln_jax.files import PARTIAL, as_type, is_file, is_folder, read_json, write_json
 from dln_jax.options import Scaled
 from dln_jax.runs.arguments import arguments_for
-from dln_jax.runs.scaled import copied_folder
+from dln_jax.runs.devices import copied_folder
 
 CONFIG = "config.json"
 """File in a run folder with the arguments that the run was started with."""

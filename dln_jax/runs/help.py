@@ -7,7 +7,7 @@ import shutil
 import textwrap
 import types
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import tyro
 
@@ -37,17 +37,6 @@ COLUMN = 20
 """Width of the column of options, characters."""
 
 
-class Option(NamedTuple):
-    """One option as the help shows it."""
-
-    name: str
-    """Name of the field."""
-    usage: str
-    """The option with a placeholder for its value, such as "--rate NUMBER"."""
-    text: str
-    """What it does, its unit and its default."""
-
-
 def help_text(arguments: type, *, prog: str, description: str, common: type | None = None, every: bool = False) -> str:
     """Help of a command.
 
@@ -60,22 +49,22 @@ def help_text(arguments: type, *, prog: str, description: str, common: type | No
     """
     width = max(60, min(shutil.get_terminal_size().columns, 100))
     every_option = [option for one in (arguments, common) if one for option in options_of(one)]
-    shown = [option for option in every_option if every or option.name not in RARE]
+    shown = [option for option in every_option if every or option[0] not in RARE]
     paragraphs = [textwrap.fill(part, width) for part in inspect.cleandoc(description).split("\n\n")]
     lines = [f"usage: {prog} [OPTIONS]", "", *"\n\n".join(paragraphs).split("\n")]
-    names = [option.name for option in every_option]
+    names = [name for name, _, _ in every_option]
     groups = {title: members for title, members in GROUPS.items() if members[0] in names}
     own = [name for name in names if not any(name in members for members in groups.values())]
     for title, members in {"options": own, **groups}.items():
-        if options := sorted((one for one in shown if one.name in members), key=lambda one: members.index(one.name)):
-            lines += ["", f"{title}:", *(line for option in options for line in _rows(option, width))]
+        if options := sorted((one for one in shown if one[0] in members), key=lambda one: members.index(one[0])):
+            lines += ["", f"{title}:", *(line for _, usage, text in options for line in _rows(usage, text, width))]
     if left := len(every_option) - len(shown):
         lines += ["", f"{left} more options: {prog} --help-all"]
     return "\n".join(lines)
 
 
-def options_of(arguments: type) -> list[Option]:
-    """Options of a dataclass, in its order."""
+def options_of(arguments: type) -> list[tuple[str, str, str]]:
+    """Options of a dataclass, in its order: name, usage such as "--rate NUMBER", and text with unit and default."""
     hints, texts, options = get_type_hints(arguments, include_extras=True), _texts(arguments), []
     for field in dataclasses.fields(arguments):
         marks = getattr(hints[field.name], "__metadata__", ())
@@ -94,7 +83,7 @@ def options_of(arguments: type) -> list[Option]:
         if kind is not bool:
             usage += f" {stated.metavar if stated and stated.metavar else _metavar(kind)}"
         text = stated.help if stated and stated.help else texts.get(field.name, "")
-        options.append(Option(field.name, usage, text + hint))
+        options.append((field.name, usage, text + hint))
     return options
 
 
@@ -122,10 +111,10 @@ def _texts(arguments: type) -> dict[str, str]:
     return texts
 
 
-def _rows(option: Option, width: int) -> list[str]:
-    head = textwrap.wrap(option.usage.replace(",", ", "), width, initial_indent="  ", subsequent_indent="      ")
+def _rows(usage: str, text: str, width: int) -> list[str]:
+    head = textwrap.wrap(usage.replace(",", ", "), width, initial_indent="  ", subsequent_indent="      ")
     head = [line.replace(", ", ",") for line in head]
-    body = textwrap.wrap(option.text, width, initial_indent=" " * COLUMN, subsequent_indent=" " * COLUMN)
+    body = textwrap.wrap(text, width, initial_indent=" " * COLUMN, subsequent_indent=" " * COLUMN)
     if len(head[-1]) < COLUMN - 1 and body:
         return [*head[:-1], f"{head[-1]:{COLUMN}}{body[0][COLUMN:]}", *body[1:]]
     return [*head, *body]

@@ -54,37 +54,37 @@ def run(
             sys.stdout.flush()  # the help; raises BrokenPipeError here if its reader has closed the pipe
         require_possible(own)
         # JAX takes a second to import, which the help and a mistake do not need.
-        from dln_jax.runs import compilation_cache, scaled
+        from dln_jax.runs import devices
         from dln_jax.runs.folder import with_stored_arguments
         from dln_jax.scale import losses_named
 
         # Data and references are float64; models state their own precision.
-        compilation_cache.enable_double_precision()
-        member = scaled.membership_in(own) if isinstance(own, Scaled) else None
+        devices.enable_double_precision()
+        member = devices.membership_in(own) if isinstance(own, Scaled) else None
         options = with_stored_arguments(own, arguments) if getattr(own, "resume", False) else own
-        before = compilation_cache.compilation().copy() if from_shell else None
-        unkept = compilation_cache.keep(shared.compilation_cache) if from_shell else ""
+        before = devices.compilation().copy() if from_shell else None
+        unkept = devices.keep_programs(shared.compilation_cache) if from_shell else ""
 
     start = began if began is not None else time.perf_counter()
 
     def work(options: Any) -> None:
-        lost = contextlib.nullcontext() if member is None else losses_named(scaled.remedy_of(options))
+        lost = contextlib.nullcontext() if member is None else losses_named(devices.remedy_of(options))
         with as_one_line(prog, options), lost, counting_from(start):
             main(options)
-            if before and (text := compilation_cache.summary(before, unkept)):
+            if before and (text := devices.compilation_summary(before, unkept)):
                 print(text)
             sys.stdout.flush()
 
     if member is not None:
         with as_one_line(prog, options):
-            options = scaled.joined(member, options, **({} if joining is None else {"seconds": joining}))
+            options = devices.joined(member, options, **({} if joining is None else {"seconds": joining}))
     try:
         work(options)
     except SystemExit as stop:
         # After an interrupt XLA may still run a program, and would abort a process that ends under it.
         if member is None and not (from_shell and stop.code == INTERRUPTED):
             raise
-        scaled.end_at_once(stop.code if isinstance(stop.code, int) else 1)
+        devices.end_at_once(stop.code if isinstance(stop.code, int) else 1)
 
 
 @contextlib.contextmanager

@@ -69,16 +69,16 @@ def verdict_of(
         reason = f"{infinite} of {len(motions)} rollouts of test motions are not finite"
         verdicts.append(Verdict("doubtful", reason, remedy))
     if properties.energy and not properties.definite:
-        definite = definiteness(fit.dynamics, whole.q, whole.qd)
-        if (share := definite.share_not_definite) > 0:
+        smallest, share, condition = definiteness(fit.dynamics, whole.q, whole.qd)
+        if share > 0:
             reason = (
                 f"the mass matrix is not positive definite at {share:.1%} of the states of the data: accelerations and "
                 "rollouts are wrong or infinite there"
             )
             verdicts.append(Verdict("refused" if share == 1 else "doubtful", reason, remedy))
-        numbers["smallest_mass_eigenvalue"] = definite.smallest_eigenvalue
-        numbers["share_not_definite"] = definite.share_not_definite
-        numbers["largest_condition_number"] = definite.largest_condition_number
+        numbers["smallest_mass_eigenvalue"] = smallest
+        numbers["share_not_definite"] = share
+        numbers["largest_condition_number"] = condition
     if fit.search is not None:
         of_search, of_descents = verdict_on_search(fit.search, held["test"])
         verdicts += [] if of_search is None else [of_search]

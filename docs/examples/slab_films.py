@@ -16,8 +16,8 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from dln_jax.figures import style
-from dln_jax.figures.animations import DPI, write_gif
 from dln_jax.figures.soft_bodies import BODY
+from dln_jax.figures.style import FILM_DPI, write_gif
 from dln_jax.softbody.mesh.mesh import Mesh, boundary, components
 from dln_jax.types import InputError, require_positive
 
@@ -86,7 +86,7 @@ def write_slab_film(
         margin = 0.04 * float((high - low).max())
         window = (low[0] - margin, high[0] + margin), (low[1] - margin, high[1] + margin)
     (west, east), (south, north) = window
-    figure = Figure(figsize=(width, width * (north - south) / (east - west) + 0.3), dpi=DPI)
+    figure = Figure(figsize=(width, width * (north - south) / (east - west) + 0.3), dpi=FILM_DPI)
     figure.subplots_adjust(0, 0, 1, 1 - 0.3 / figure.get_figheight())
     axis = figure.add_subplot()
     axis.set(xlim=window[0], ylim=window[1], aspect="equal")

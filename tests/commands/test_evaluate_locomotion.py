@@ -34,11 +34,11 @@ def trials(distance, steps, ahead):
 
 
 def test_a_policy_comes_back_with_its_ground_or_with_other_ground(run):
-    stored = load_policy(run)
-    assert stored.task.variation == (0.01, 4.0, 0.0, 0.0) and stored.task.clock_period == 9.0
-    expected = make_policy(stored.task, width=5).init(jax.random.key(3))
-    jax.tree.map(np.testing.assert_array_equal, stored.parameters, expected)
-    assert load_policy(run, slope=0.0, rough=0.05, push=None).task.variation == (0.01, 0.0, 0.05, 0.0)
+    task, _, parameters, _ = load_policy(run)
+    assert task.variation == (0.01, 4.0, 0.0, 0.0) and task.clock_period == 9.0
+    expected = make_policy(task, width=5).init(jax.random.key(3))
+    jax.tree.map(np.testing.assert_array_equal, parameters, expected)
+    assert load_policy(run, slope=0.0, rough=0.05, push=None)[0].variation == (0.01, 0.0, 0.05, 0.0)
 
 
 def test_a_policy_is_good_if_it_hardly_falls_and_goes_ahead_everywhere():

@@ -9,9 +9,8 @@ from motions import quick_motion
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax import HamiltonianSystem, flow, load
-from dln_jax.commands import train_hnn_pixels
-from dln_jax.commands.pixels import fit, frames
-from dln_jax.commands.pixels.frames import FRAME_TIME, PIXELS, SIDE, energy, render, rod, swinging_rod
+from dln_jax.commands import pixel_films, pixels, train_hnn_pixels
+from dln_jax.commands.pixel_films import FRAME_TIME, PIXELS, SIDE, energy, render, rod, swinging_rod
 from dln_jax.mechanics.dynamics import PhaseRates
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.metrics.phase_space import Motions
@@ -39,8 +38,8 @@ def quick_predict(model, parameters, q, p, t):
 @pytest.fixture(scope="module", autouse=True)
 def _quick():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(frames, "predict", quick_predict)
-        patch.setattr(frames, "rollouts", quick_motions)
+        patch.setattr(pixel_films, "predict", quick_predict)
+        patch.setattr(pixel_films, "rollouts", quick_motions)
         yield
 
 
@@ -90,12 +89,12 @@ def test_the_point_pendulum_is_gyms_rod():
 
 def test_estimator_recovers_states(data):
     angles, _ = quick_motions(rod(), STATES[:, :1], STATES[:, 1:], np.array([0.0, FRAME_TIME]))
-    states = frames.physical_states(np.concatenate([*map(pictures64, angles[..., 0].T)], axis=1))
+    states = pixel_films.physical_states(np.concatenate([*map(pictures64, angles[..., 0].T)], axis=1))
     assert_allclose(states[0], STATES[:, 0], atol=1e-9)
     assert_allclose(states[1], STATES[:, 1], atol=1e-6)
     # Frames of the data are float32.
     for q, wrong in ((data.q, False), (2 * data.q, True)):
-        errors = frames.energy_errors(data.pairs, energy(q, data.qd)[:, :-1])
+        errors = pixel_films.energy_errors(data.pairs, energy(q, data.qd)[:, :-1])
         assert errors.min() > 1e-4 if wrong else errors.mean() < 1e-14
 
 
@@ -122,16 +121,16 @@ def test_loss_by_hand():
     pushed = np.mean((p[:, :1] * c - 0.2 * q[:, :1] * s - p[:, 1:]) ** 2)
     of_image, of_q, of_p = np.mean([x.var(), following.var()]), q.var(), p.var()
     given = oscillator(scale, factor), jnp.asarray(films)
-    found = fit.terms(*given)
+    found = pixels.terms(*given)
     expected = image / of_image, change / of_p, (moved / of_q + pushed / of_p) / 2
     for ours, theirs, tolerance in zip(found, expected, (1e-9, 1e-9, 1e-4), strict=True):
         assert_allclose(ours, theirs, rtol=tolerance)
-    assert_allclose(fit.loss(*given), found[0] + found[1] + 10 * found[2], rtol=1e-9)
+    assert_allclose(pixels.loss(*given), found[0] + found[1] + 10 * found[2], rtol=1e-9)
 
 
 def test_windows_are_segments_of_one_trajectory():
     assert_array_equal(
-        fit.windows_of(np.arange(2 * 7).reshape(2, 7, 1))[..., 0], [[0, 1, 2], [3, 4, 5], [7, 8, 9], [10, 11, 12]]
+        pixels.windows_of(np.arange(2 * 7).reshape(2, 7, 1))[..., 0], [[0, 1, 2], [3, 4, 5], [7, 8, 9], [10, 11, 12]]
     )
 
 
@@ -145,7 +144,7 @@ def small_model(field, components):
 def test_autoencoders_read_two_frames(data):
     """The momentum is the change of the coordinate, for any parameters."""
     model, parameters = small_model("phase-network", 4)
-    system = model.images(parameters | {"components": fit.principal_components(data.frames, 4)})
+    system = model.images(parameters | {"components": pixels.principal_components(data.frames, 4)})
     first, second, other = data.frames[0, 0], data.frames[0, 1], data.frames[3, 2]
     pairs = jnp.asarray([[first, second], [first, other], [second, first]]).reshape(3, -1)
     q, p = jax.jit(jax.vmap(system.encode))(pairs)
@@ -155,10 +154,10 @@ def test_autoencoders_read_two_frames(data):
 
 
 def test_components_keep_the_images(data):
-    components = fit.principal_components(data.frames, 12)
+    components = pixels.principal_components(data.frames, 12)
     basis, mean = components["basis"], components["mean"]
     assert_allclose(basis @ basis.T, np.eye(12), atol=1e-12)
-    coefficients = fit.compress(components, data.frames)
+    coefficients = pixels.compress(components, data.frames)
     assert coefficients.dtype == np.float32 and coefficients.shape == (4, 13, 12)
     assert_allclose(np.sqrt(np.mean(coefficients**2)), components["scale"], rtol=1e-5)
     kept = mean + coefficients @ basis
@@ -177,8 +176,8 @@ def test_components_keep_the_images(data):
 @pytest.mark.slow
 def test_latent_motions_keep_the_energy(data):
     model, parameters = small_model("black-box-hnn", 4)
-    parameters |= {"components": fit.principal_components(data.frames, 4)}
-    numbers, films = frames.film_errors(model, parameters, data)
+    parameters |= {"components": pixels.principal_components(data.frames, 4)}
+    numbers, films = pixel_films.film_errors(model, parameters, data)
     assert films.shape == data.pairs.shape and numbers["energy_mse"] > numbers["energy_floor"]
     field = with_float64(parameters["parameters"]["field"])
     moved = quick_predict(model.field, field, jnp.array([[0.3], [-1.0]]), jnp.array([[0.1], [0.2]]), np.arange(30.0))
@@ -189,7 +188,7 @@ def test_latent_motions_keep_the_energy(data):
 
 def test_injection_raises_the_energy_to_what_was_asked():
     """Along the gradient of q² + p² / 2 from (3, 4), q = 3 e^(2u) and p = 4 e^u."""
-    raise_energy = jax.jit(frames.raise_energy, static_argnums=0)
+    raise_energy = jax.jit(pixel_films.raise_energy, static_argnums=0)
     q, p = raise_energy(lambda q, p: jnp.sum(q**2 + p**2 / 2), jnp.array([3.0]), jnp.array([4.0]), 60.0)
     assert_allclose(q**2 + p**2 / 2, 60.0, rtol=1e-9)
     assert_allclose(q / 3, (p / 4) ** 2, rtol=1e-5)
@@ -199,12 +198,12 @@ def test_films_are_judged_by_the_motion_in_them(data):
     """The true film is good; one that stands still is refused."""
     still = np.broadcast_to(data.pairs[:, :1], data.pairs.shape)
     for film, level in ((data.pairs, "good"), (still, "refused")):
-        assert frames.judge_films(film, data).level == level
+        assert pixel_films.judge_films(film, data).level == level
 
 
 def test_a_run_is_judged_resumes_and_loads(tmp_path, monkeypatch, capsys):
     films = swinging_rod(13, 13)
-    monkeypatch.setattr(frames, "swinging_rod", lambda _: films)
+    monkeypatch.setattr(pixel_films, "swinging_rod", lambda _: films)
     run = tmp_path / "run"
     command(train_hnn_pixels, "--model phase-network --steps 1 --out", run)
     assert "verdict: refused" in capsys.readouterr().out

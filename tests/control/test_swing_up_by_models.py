@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.control.closed_loop import hanging_starts, outcomes, simulate
 from dln_jax.control.estimate.kalman import mechanical
-from dln_jax.control.plants.estimators import by_differences, by_filter
+from dln_jax.control.observers import by_differences, by_filter
 from dln_jax.control.state_space import field_of
 from dln_jax.control.swing_up import USUAL, law_of, nearest_equilibrium, swing_up_numbers, upright_of
 from dln_jax.mechanics.dynamics import InverseForward

@@ -9,14 +9,15 @@ import optax
 import pytest
 from calls import one_line
 
-from dln_jax.learning.engine import newton, optimisers
+from dln_jax.learning.engine import optimisers
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
-from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.fit import ALL, SOME, fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.engine.problem import Problem, Stop, loss_of
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulums import cart_pole
+from dln_jax.solvers import levenberg_marquardt
 
 X = jnp.linspace(-1, 1, 50)
 LINE = (X, 3 * X - 1)
@@ -189,17 +190,17 @@ def test_seeds_in_one_program_equal_single_runs(name):
     assert together.validation[1] == pytest.approx(alone.validation, rel=1e-6)
     assert together.best_step[1] == alone.best_step
     if name == "newton, seeds":
-        assert [at.stage for at in together.history] == 3 * [newton.SOME] + 4 * [newton.ALL]
+        assert [at.stage for at in together.history] == 3 * [SOME] + 4 * [ALL]
         assert [at.step for at in together.history] == [2, 4, 5, 7, 9, 11, 13]
 
 
 def test_the_best_of_some_samples_starts_the_stage_on_all_and_a_target_ends_it(monkeypatch):
     started = []
-    solver = newton.levenberg_marquardt.init
-    monkeypatch.setattr(newton.levenberg_marquardt, "init", lambda x: started.append(x) or solver(x))
+    solver = levenberg_marquardt.init
+    monkeypatch.setattr(levenberg_marquardt, "init", lambda x: started.append(x) or solver(x))
     optimiser = NEWTON._replace(steps_per_dispatch=1)
     training = fit(bumps(BUMPS), optimiser)
-    some = [at for at in training.history if at.stage == newton.SOME]
+    some = [at for at in training.history if at.stage == SOME]
     best = min(some, key=lambda at: at.validation)
     assert best is not some[-1] and abs(float(started[1][0][0]) - 1.2) == pytest.approx(best.validation, rel=1e-12)
     few = fit(bumps(BUMPS), optimiser._replace(coarse_samples=40))

@@ -93,6 +93,5 @@ def test_each_reference_is_driven_with_what_was_learned_before():
     drive = lambda parameters, reference: (parameters, part if reference == "long" else nothing)  # noqa: E731
     refit = lambda parameters, replay: parameters + replay.recorded  # noqa: E731
     visits = list(learn_online(["long", "short", "long"], drive, refit, 0, empty_replay(12, 2)))
-    assert [visit.outcome for visit in visits] == [0, 5, 5]
-    assert [visit.parameters for visit in visits] == [5, 5, 15]
-    assert visits[-1].replay.recorded == 10
+    assert [visit[:2] for visit in visits] == [(0, 5), (5, 5), (5, 15)]
+    assert visits[-1][2].recorded == 10

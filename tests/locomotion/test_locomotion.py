@@ -14,8 +14,8 @@ from jax.sharding import Mesh
 from PIL import Image
 
 from dln_jax.commands import train_locomotion
-from dln_jax.figures.animations import write_gif
 from dln_jax.figures.soft_bodies import soft_body_drawing
+from dln_jax.figures.style import write_gif
 from dln_jax.locomotion import learning
 from dln_jax.locomotion.gradient import GradientSettings, make_policy, make_updates, targets
 from dln_jax.locomotion.learning import Learned, Record, learn, make_learner, train

@@ -12,9 +12,9 @@ PROGRAM = '''
 import dataclasses
 import jax, jax.numpy as jnp
 from dln_jax.runs import running
-from dln_jax.runs import compilation_cache
+from dln_jax.runs import devices
 
-compilation_cache.LEAST_SECONDS = 0.0
+devices.LEAST_SECONDS = 0.0
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
@@ -23,9 +23,9 @@ class Arguments:
     """Size of the vector."""
 
 def main(given):
-    before = compilation_cache.compilation()["cached"]
+    before = devices.compilation()["cached"]
     jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones(given.size))
-    print("found", compilation_cache.compilation()["cached"] - before)
+    print("found", devices.compilation()["cached"] - before)
 
 running.run(main, Arguments, prog="tiny", began=0.0)
 '''

@@ -59,7 +59,7 @@ def test_help_is_short_and_every_option_has_a_text(name, monkeypatch, capsys):
     short, whole = texts
     assert len(short) <= 60 and max(map(len, short + whole)) <= 80
     assert sum(line.startswith("  --") for line in short) <= 22
-    assert all(option.text.strip() for option in options_of(arguments_for(module.Arguments, {})))
+    assert all(text.strip() for *_, text in options_of(arguments_for(module.Arguments, {})))
 
 
 def shown(options, name):

@@ -6,8 +6,8 @@ from calls import refused
 from dln_jax.commands import train_delan, train_diffnet, train_hnn, train_locomotion, train_value
 from dln_jax.options import Scaled
 from dln_jax.runs.arguments import arguments_for, arguments_of
+from dln_jax.runs.devices import mesh_of
 from dln_jax.runs.folder import stored_arguments
-from dln_jax.runs.scaled import mesh_of
 
 TOGETHER = "--processes 2 --coordinator 127.0.0.1:61440 --process-id 1"
 

@@ -14,8 +14,7 @@ from sharing import begun
 from dln_jax.control.optimal.action_costs import quadratic
 from dln_jax.control.optimal.fitted import Iteration, fit_value
 from dln_jax.control.optimal.problem import ControlProblem
-from dln_jax.control.optimal.residual import fit_hjb
-from dln_jax.control.optimal.value_networks import value_network
+from dln_jax.control.optimal.value_networks import fit_hjb, value_network
 from dln_jax.locomotion.gradient import GradientSettings, make_policy
 from dln_jax.locomotion.learning import learn, make_learner
 from dln_jax.locomotion.task import make_task

@@ -25,7 +25,7 @@ from dln_jax.options import Resumable, Scaled
 from dln_jax.runs.progress import progress
 from dln_jax.runs.running import run
 from dln_jax.runs.folder import command_folder
-from dln_jax.runs.scaled import mesh_of
+from dln_jax.runs.devices import mesh_of
 from dln_jax.scale import of_first_process, shard, spread
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import load_tree, save_tree

@@ -159,7 +159,7 @@ def generate(name: str, trajectories: int | None = None) -> PhaseLog:
         task,
         made.scene.needs,
         fitted=made.train.data,
-        held_out=made.test.data._replace(**made.test.field._asdict()),
+        held_out=made.test.field,
         truth=(Motions(t, *motions),),
         energy=made.hamiltonian,
         published_energy=made.published_energy,

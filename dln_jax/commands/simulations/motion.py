@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.commands.simulations.scenes import PreparedScene, in_precision
-from dln_jax.figures.animations import write_gif
 from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure, soft_body_drawing
+from dln_jax.figures.style import write_gif
 from dln_jax.files import write_figure
 from dln_jax.metrics.report import Row
 from dln_jax.metrics.soft_body_energies import motion_energies

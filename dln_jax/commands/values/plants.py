@@ -12,8 +12,7 @@ from jax import Array
 
 from dln_jax.control.optimal.own_plants import FOLDER, OwnProblem, own_problem
 from dln_jax.control.plants.mujoco_plants import mujoco_plant, plant_file
-from dln_jax.control.plants.plant import Layout, layout
-from dln_jax.control.plants.postures import extremes
+from dln_jax.control.plants.plant import Layout, extremes, layout
 from dln_jax.control.state_space import Field, field_of
 from dln_jax.data.joints import needs_from_json
 from dln_jax.data.robots import read_robot

@@ -16,17 +16,16 @@ from dln_jax.commands.values.plants import file_of, of_file, of_run, problem_of,
 from dln_jax.control.optimal.fitted import Iteration, fit_values
 from dln_jax.control.optimal.own_plants import described, own_settings
 from dln_jax.control.optimal.problem import ControlProblem, Disturbance, from_field, worst_disturbance
-from dln_jax.control.optimal.residual import discounts_down_to, fit_hjb
-from dln_jax.control.optimal.value_networks import ValueFit, ValueNetwork, ValueProgress
+from dln_jax.control.optimal.value_networks import ValueFit, ValueNetwork, ValueProgress, discounts_down_to, fit_hjb
 from dln_jax.files import finite
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.problem import Progress
 from dln_jax.precision import with_float64
 from dln_jax.runs.arguments import names_listed, numbers_of, require_positive_if_given
+from dln_jax.runs.devices import mesh_of
 from dln_jax.runs.folder import command_folder
 from dln_jax.runs.progress import progress
 from dln_jax.runs.report import Report, finish, png, rows_of
-from dln_jax.runs.scaled import mesh_of
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import load, save
 from dln_jax.zoo.value_functions import ValueRun, network_of, plant_of_model, save_value

@@ -5,10 +5,21 @@
 L is lower triangular with a positive diagonal; its entries are the outputs of a differential network of z - z0
 (Lutter et al. 2021, arXiv:2105.04682). z holds the sines and cosines of angles and the other states in units of the
 box. Without hidden layers L is constant and V a quadratic form, which solves a linear-quadratic problem exactly.
-The parameters have a leading axis of ensemble members; V and V_x are the means over it. `fitted` and
-`residual` fit them.
+The parameters have a leading axis of ensemble members; V and V_x are the means over it. The module `fitted`
+fits them by rollouts.
+
+`fit_hjb` fits them to the Hamilton-Jacobi-Bellman equation, by Levenberg-Marquardt in float64. It minimises the mean
+square over the box of
+
+    (rho V + g*(-Bᵀ V_x) - q - aᵀ V_x) / (mean of q)
+
+The equation has several solutions, and only one is the cost to go. With a large discount that one is near q / rho
+and the others are far away. Training starts there and follows it while the discount decreases to the problem's own
+(continuation: Lutter, Belousov et al. 2019). Every fit draws new samples; unseen samples select the parameters.
 """
 
+import functools
+import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -16,12 +27,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 from jaxtyping import Float
 
-from dln_jax.control.optimal.problem import ControlProblem, features
+from dln_jax.control.optimal.problem import (
+    ControlProblem,
+    Disturbance,
+    checked,
+    features,
+    hjb_residual,
+    optimal_control,
+    uniform,
+)
 from dln_jax.errors import require_network
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import Activation, softplus, tanh
+from dln_jax.precision import quick_compilation
+from dln_jax.process import held_back
+from dln_jax.scale import local, of_first_process, program
+from dln_jax.solvers import levenberg_marquardt
 from dln_jax.types import InputError, require_positive
 
 
@@ -119,3 +143,116 @@ def value_network(
         return jnp.mean(values), jnp.mean(slopes, axis=0)
 
     return ValueNetwork(init, mean, every)
+
+
+def discounts_down_to(discount: float, *, first: float = 30.0, ratio: float = 0.5, last: float = 0.01) -> list[float]:
+    """Returns discount + first ratioᵏ while the second term is at least `last`, then the discount itself, all in 1/s.
+
+    Args:
+        discount: rho of the problem.
+        first: first increment; V is then about q / (rho + first).
+        ratio: ratio of consecutive increments, between 0 and 1.
+        last: lower bound of the increments.
+
+    Raises:
+        InputError: a number is out of range.
+    """
+    require_positive(first=first, ratio=ratio, last=last)
+    if not ratio < 1:
+        raise InputError(f"ratio is {ratio}; expected less than 1, so that the discount decreases")
+    steps = max(int(np.floor(np.log(last / first) / np.log(ratio))), 0) + 1
+    return [*(discount + first * ratio**step for step in range(steps)), discount]
+
+
+def fit_hjb(
+    problem: ControlProblem,
+    value_and_gradient: Callable[[Any, Array], tuple[Array, Array]],
+    parameters: Any,
+    key: Array,
+    *,
+    discounts: Sequence[float] | None = None,
+    samples: int = 4096,
+    validation: int = 2048,
+    iterations: int = 20,
+    rounds: int = 10,
+    patience: int = 2,
+    disturbance: Disturbance | None = None,
+    mesh: Mesh | None = None,
+    report: Callable[[ValueProgress], None] = lambda progress: None,
+) -> ValueFit:
+    """Fits a value function to the equation, in float64.
+
+    Args:
+        problem: the control problem.
+        value_and_gradient: (parameters, x) -> V and V_x, for example of `value_network`.
+        parameters: initial parameters, float64.
+        key: random key of the samples.
+        discounts: decreasing to the problem's own; by default `discounts_down_to` it.
+        samples: number of samples per draw, uniform in the box.
+        validation: number of samples that select the parameters.
+        iterations: largest number of Levenberg-Marquardt iterations per draw of samples.
+        rounds: largest number of draws at the last discount.
+        patience: the fit ends after this many rounds without a lower validation.
+        disturbance: worst-case disturbance, for a robust value function.
+        mesh: devices that share the samples of a fit.
+        report: called after every draw, with residuals that are root mean squares relative to the mean of q: `loss` on
+            the samples of the fit, `validation` on others, with this discount.
+
+    Raises:
+        InputError: the problem is invalid, the discounts do not end with its own, or the equation is not finite.
+    """
+    problem = checked(problem)
+    require_positive(samples=samples, validation=validation, iterations=iterations, rounds=rounds, patience=patience)
+    discounts = discounts_down_to(problem.discount) if discounts is None else list(discounts)
+    if not discounts or discounts[-1] != problem.discount:
+        raise InputError(f"discounts are {discounts}; expected a list that ends with the problem's, {problem.discount}")
+    of_draws, of_validation = jax.random.split(key)
+    unseen = uniform(problem, of_validation, validation)
+    unit = float(jnp.mean(jax.vmap(problem.state_cost)(unseen)))
+
+    def residual(parameters: Any, x: Array, discount: Array) -> Array:
+        value, slope = value_and_gradient(parameters, x)
+        left = hjb_residual(problem._replace(discount=discount), x, value, slope)
+        if disturbance is not None:
+            left -= disturbance(x, slope, optimal_control(problem, x, slope)) @ slope
+        return left / unit
+
+    @functools.partial(program, mesh=mesh, compiler_options=quick_compilation())
+    def advance(parameters: Any, x: Array, discount: Array) -> tuple[Any, Array]:
+        chunks = levenberg_marquardt.in_chunks((x, jnp.full(len(x), discount)), mesh)
+        start = levenberg_marquardt.init(parameters)
+        state = levenberg_marquardt.run_on_chunks(residual, start, chunks, iterations, samples=samples, mesh=mesh)
+        return state.parameters, jnp.sqrt(state.loss)
+
+    @functools.partial(program, mesh=mesh)
+    def validated(parameters: Any, discount: Array) -> Array:
+        return jnp.sqrt(jnp.mean(jax.vmap(residual, (None, 0, None))(parameters, unseen, discount) ** 2))
+
+    history: list[ValueProgress] = []
+    began = time.perf_counter()
+
+    def fitted(parameters: Any, discount: float) -> Any:
+        x = uniform(problem, jax.random.fold_in(of_draws, len(history)), samples)
+        with held_back():  # as in `fitted.fit_values`
+            parameters, loss = advance(parameters, x, jnp.asarray(discount))
+            # This number decides how many rounds there are, so all processes must use the same value.
+            left = of_first_process(float(validated(parameters, jnp.asarray(discount))), mesh)
+            passed = time.perf_counter() - began
+            history.append(ValueProgress(len(history) + 1, float(loss), float(left), passed, discount))
+        report(history[-1])
+        return parameters
+
+    for discount in discounts[:-1]:
+        parameters = fitted(parameters, discount)
+    best, lowest, since = parameters, np.inf, 0
+    for _ in range(rounds):
+        parameters = fitted(parameters, problem.discount)
+        score = history[-1].validation
+        best, lowest, since = (parameters, score, 0) if score < lowest else (best, lowest, since + 1)
+        if since >= patience:
+            break
+    if not np.isfinite(lowest):
+        raise InputError(
+            "the equation is not finite at the samples; look for states in the box where the plant or a cost is not"
+        )
+    return ValueFit(local(best, mesh), float(lowest), history, history[-1].seconds)

@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from dln_jax.control.closed_loop import Controller
 from dln_jax.control.energy_shaping import energy_shaping
-from dln_jax.control.plants.estimators import by_differences
+from dln_jax.control.observers import by_differences
 from dln_jax.control.plants.planned import READY, follower, plans_of, with_feedback
 from dln_jax.control.plants.plant import Layout, Plant
 from dln_jax.control.plants.runs import PlantRun, compiled, distances, run

@@ -9,8 +9,7 @@ import numpy as np
 from jax import Array
 
 from dln_jax.control.closed_loop import ClosedLoopRun, Controller, Hardware, simulate
-from dln_jax.control.plants.plant import Plant, layout, simulated
-from dln_jax.control.plants.postures import extremes
+from dln_jax.control.plants.plant import Plant, extremes, layout, simulated
 from dln_jax.data.robot_xml import driven_joints, parse_robot, velocity_limits
 from dln_jax.data.robots import Robot, compile_robot, compiled_model, joint_names, quiet, require_ranges, robot_of
 from dln_jax.types import InputError, require_positive

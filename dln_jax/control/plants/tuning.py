@@ -22,7 +22,7 @@ import numpy as np
 from jax import Array
 
 from dln_jax.control.closed_loop import Controller, Hardware, simulate, stateless
-from dln_jax.control.plants.estimators import Estimator, by_differences
+from dln_jax.control.observers import Estimator, by_differences
 from dln_jax.control.plants.planned import (
     TrackedPlan,
     by_repeated_plans,

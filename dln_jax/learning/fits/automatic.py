@@ -215,7 +215,8 @@ def is_definite(result: Fit, parts: Parts) -> bool:
     data = parts.sets.validation
     with jax.enable_x64(True):
         mechanics = dynamics(result.model.energies(result.parameters))
-        return definiteness(mechanics, data.q, data.qd).share_not_definite == 0
+        _, share_not_definite, _ = definiteness(mechanics, data.q, data.qd)
+    return share_not_definite == 0
 
 
 def identify_robot(log: Log, parts: Parts) -> Fit:

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.learning.kinematics.frames import Frames, displace, free_directions
 from dln_jax.mechanics.trees.description import Tree
-from dln_jax.mechanics.trees.scanned import scanned_forces, scanned_regressor
+from dln_jax.mechanics.trees.recursions import scanned_forces, scanned_regressor
 from dln_jax.precision import compiled
 from dln_jax.types import JointKind, Vector
 

@@ -51,8 +51,8 @@ def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Traject
     path by inverse kinematics, differentiation and the closed-form equations of motion.
     """
     require_finite(dt=dt)
-    paths = [letter_path(letter) for letter in letters]
-    times = [np.arange(0.0, path.duration, dt) for path in paths]
+    durations, positions = zip(*map(letter_path, letters), strict=True)
+    times = [np.arange(0.0, duration, dt) for duration in durations]
 
     @jax.jit
     def states(position, t):
@@ -70,7 +70,7 @@ def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Traject
 
     # All letters use the longest duration and thus share a compilation; beyond its end a path rests.
     longest = dt * np.arange(max(map(len, times)))
-    motions = [states(path.position, longest) for path in paths]
+    motions = [states(position, longest) for position in positions]
     cut = [[np.asarray(values)[: len(t)] for values in motion] for motion, t in zip(motions, times, strict=True)]
     q, qd, qdd = map(np.concatenate, zip(*cut, strict=True))
     trajectory = np.repeat(np.arange(len(times)), [len(t) for t in times])

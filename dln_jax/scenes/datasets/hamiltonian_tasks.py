@@ -53,13 +53,6 @@ from dln_jax.types import Dissipation, Hamiltonian, InputError, Potential, Scala
 _GROUP = 500
 
 
-class PhaseField(NamedTuple):
-    """Time derivatives of states."""
-
-    qd: Float[np.ndarray, "N d"]
-    pd: Float[np.ndarray, "N d"]
-
-
 class PhaseSamples(NamedTuple):
     """One side of the published split; all members have the same N samples."""
 
@@ -67,8 +60,8 @@ class PhaseSamples(NamedTuple):
     """As published: q and p with noise; qd, pd (and qdd) of the noiseless motion; tau = 0 exactly."""
     clean: Trajectories
     """The same samples without noise."""
-    field: PhaseField
-    """The exact (qd, pd) at the noisy q, p of `data`."""
+    field: Trajectories
+    """`data` with the exact (qd, pd) at its noisy q, p."""
 
 
 class PhaseTask(NamedTuple):
@@ -229,19 +222,18 @@ def _task(
     motion = reference_motion(H, starts[:, 0], starts[:, 1], t, dissipation=scene.dissipation)
     exact = functools.partial(_fields, H, scene.dissipation)
     q, p = (states.reshape(-1, d) for states in motion)
-    field = qd, pd = tuple(np.asarray(rate) for rate in exact(q, p))
+    qd, pd = (np.asarray(rate) for rate in exact(q, p))
     qdd = np.asarray(_accelerations(H, q, p, qd, pd))
     trajectory, label = np.repeat(order, len(t)), np.array([f"{scene.name}-{index}" for index in order])
     times, tau = np.tile(t, len(starts)), np.zeros_like(q)
-    data = clean = Trajectories(times, q, qd, qdd, tau, trajectory, label, p, pd, needs=scene.needs)
+    data = clean = field = Trajectories(times, q, qd, qdd, tau, trajectory, label, p, pd, needs=scene.needs)
     if errors is not None:
         data = clean._replace(q=q + errors[:, 0].reshape(-1, d), p=p + errors[:, 1].reshape(-1, d))
-        field = tuple(np.asarray(rate) for rate in exact(data.q, data.p))
+        noisy_qd, noisy_pd = (np.asarray(rate) for rate in exact(data.q, data.p))
+        field = data._replace(qd=noisy_qd, pd=noisy_pd)
 
     def part(indices: np.ndarray) -> PhaseSamples:
-        chosen = np.isin(trajectory, indices)
-        rates = PhaseField(*(rate[chosen] for rate in field))
-        return PhaseSamples(select(data, indices), select(clean, indices), rates)
+        return PhaseSamples(*(select(motions, indices) for motions in (data, clean, field)))
 
     return PhaseTask(scene, H, H, t, part(train), part(test))
 

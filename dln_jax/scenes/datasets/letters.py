@@ -17,7 +17,6 @@ The shapes come from the font's own integer coordinates, so they do not depend o
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import matplotlib
@@ -37,19 +36,6 @@ _SAMPLES = 4096
 """Number of points per contour for computing the Fourier series."""
 _HARMONICS = 96
 """Highest harmonic of the series; with the default smoothing the remainder is below a micrometre."""
-
-
-class LetterPath(NamedTuple):
-    """A letter as a motion of the tip, at rest before time 0 and after `duration`."""
-
-    duration: float
-    """Time from rest to rest, s."""
-    position: Callable[[Scalar], Float[Array, "2"]]
-    """Time in s -> tip (x, y) in m; `jax.jvp` gives the velocity, and once more the acceleration.
-
-    It is a pytree: passed to a jitted function as an argument, all letters with the same number of strokes share one
-    compilation. It is constant outside 0..duration and computes in JAX's default float.
-    """
 
 
 class _DesignUnits(TextToPath):
@@ -172,8 +158,13 @@ def letter_path(
     smoothing: float = 0.04,
     bend_radius: float = 0.3,
     ramp_length: float = 0.2,
-) -> LetterPath:
+) -> tuple[float, Callable[[Scalar], Float[Array, "2"]]]:
     """Returns the tip's motion along the outline of a character; the module docstring describes the steps.
+
+    The results are the time from rest to rest in s, and a function: time in s -> tip (x, y) in m. `jax.jvp` gives the
+    velocity, and once more the acceleration. The function is a pytree: passed to a jitted function as an argument, all
+    letters with the same number of strokes share one compilation. It is constant before and after the motion and
+    computes in JAX's default float.
 
     Args:
         character: one printable character of DejaVu Sans that has an outline.
@@ -213,4 +204,4 @@ def letter_path(
     costs = lengths + ramp_length
     shares = costs / costs.sum()
     times = duration, np.cumsum(shares) - shares, shares, np.minimum(ramp_length / costs, 0.5)
-    return LetterPath(duration, Partial(_position, *map(jnp.asarray, (*times, cosines, sines, displacements))))
+    return duration, Partial(_position, *map(jnp.asarray, (*times, cosines, sines, displacements)))

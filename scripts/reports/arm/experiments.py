@@ -224,7 +224,7 @@ def measure_online(
         write = writing(law, speed, encoder_noise)
         errors = np.array(
             [
-                [visit.outcome for visit in learn_online(order, write, refit, start(seed), replay)]
+                [outcome for outcome, *_ in learn_online(order, write, refit, start(seed), replay)]
                 for seed, order in enumerate(orders)
             ]
         )

@@ -18,8 +18,8 @@ from dln_jax.commands.phase_spaces.data import MEASURED, REAL, PhaseLog, generat
 from dln_jax.commands.phase_spaces.models import choose_model, description_of
 from dln_jax.commands.phase_spaces.results import errors, predicted_motions
 from dln_jax.commands.phase_spaces.training import POLYNOMIAL, PhaseFit, train
-from dln_jax.commands.pixels.fit import fit, measure
-from dln_jax.commands.pixels.frames import TRAJECTORIES, swinging_rod
+from dln_jax.commands.pixel_films import TRAJECTORIES, swinging_rod
+from dln_jax.commands.pixels import fit, measure
 from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.metrics.phase_space import Motions, motion_errors, predict
 from dln_jax.models.latent_phase import Field

@@ -18,7 +18,7 @@ from dln_jax.commands.learned_plants import SECONDS, file_of, fit_of, learn_to_s
 from dln_jax.commands.learned_plants import model_of as identified_model
 from dln_jax.control.closed_loop import ClosedLoopRun, Controller, Hardware, hanging_starts, outcomes, simulate
 from dln_jax.control.estimate.tuning import from_log
-from dln_jax.control.plants.estimators import by_differences, by_filter
+from dln_jax.control.observers import by_differences, by_filter
 from dln_jax.control.plants.exploring import Exploration, explore
 from dln_jax.control.plants.mujoco_plants import mujoco_plant
 from dln_jax.control.plants.plant import Plant

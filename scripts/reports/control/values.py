@@ -25,8 +25,7 @@ from dln_jax.control.optimal.problem import (
     hjb_policy,
     worst_disturbance,
 )
-from dln_jax.control.optimal.residual import fit_hjb
-from dln_jax.control.optimal.value_networks import value_network
+from dln_jax.control.optimal.value_networks import fit_hjb, value_network
 from dln_jax.control.regulators import lqr
 from dln_jax.control.shooting import shoot
 from dln_jax.control.state_space import Law

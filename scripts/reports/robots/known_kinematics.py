@@ -167,8 +167,8 @@ def added_terms(*, logs_without: int = 20, logs_with: int = 5) -> Numbers:
             state["temperature"] = np.stack([20 + 25 * (1 - np.exp(-t / 8))] * 2, axis=1)
             tau = np.asarray(program(**state)) + NOISE * random.normal(size=(SAMPLES, 2))
             log = from_arrays({"t": t, "trajectory": np.zeros(SAMPLES, int), "tau": tau, **state})
-            for tried in choose_terms(ARM, log, Terms(PLANT_LAWS), additions)[1]:
-                kept[f"share_keeping_{tried.name}"] += tried.kept / count
+            for name in choose_terms(ARM, log, Terms(PLANT_LAWS), additions)[1]:
+                kept[f"share_keeping_{name}"] += 1 / count
         numbers[f"added-terms/{plant}"] = kept
     return numbers
 
@@ -203,7 +203,7 @@ def encoders(*, motions: int = 15, unseen: int = 6, parts: int = 3) -> Numbers:
                 "momentum-twice-the-cutoff": (fit_momentum, twice.data),
             }
             for way, (fit, data) in fits.items():
-                torque = torque_of(model, fit(model, data, **TOLERANCES).parameters)
+                torque = torque_of(model, fit(model, data, **TOLERANCES)[0])
                 errors.setdefault(way, []).append(float(error_of(torque, test).mean()))
         for way, values in errors.items():
             numbers[f"encoders/{name}/{way}"] = {"nmse_median": np.median(values), "nmse_worst": np.max(values)}

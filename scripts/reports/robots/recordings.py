@@ -235,7 +235,7 @@ def arm_fits(tree: Tree, data: Trajectories) -> dict[str, Torque]:
     laws = min(LAWS, key=lambda laws: error_of(torque_by(fit_friction(tree, train, laws)), validation).mean())
     full = fit_friction(tree, data, laws)
     # The tree has seen what the network's size is chosen by, which leaves a network less to better there.
-    network = fit_residual(full.model, full.parameters, tree.needs, train, validation)
+    model, parameters, _ = fit_residual(full.model, full.parameters, tree.needs, train, validation)
     needs = tree.needs._replace(friction=True)
     trees = [fit_tree(needs, train, validation, velocity_scale=scale) for scale in (0.01, 0.1)]
     learned = tree_of(min(trees, key=lambda measured: measured.validation_error).parameters, needs)
@@ -243,7 +243,7 @@ def arm_fits(tree: Tree, data: Trajectories) -> dict[str, Torque]:
     torques = {
         "usual-friction": torque_by(fit_friction(tree, data, LAWS[0])),
         "chosen-friction": torque_by(full),
-        "with-residual": torque_of(network.model, network.parameters),
+        "with-residual": torque_of(model, parameters),
         "learned-tree": torque_by(fit_friction(learned._replace(**frames), data, laws)),
     }
     rival = regression(tree, data, USUAL_SCALE)

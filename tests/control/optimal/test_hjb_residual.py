@@ -10,8 +10,7 @@ from scipy.optimize import brentq
 
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
 from dln_jax.control.optimal.problem import ControlProblem
-from dln_jax.control.optimal.residual import discounts_down_to, fit_hjb
-from dln_jax.control.optimal.value_networks import value_network
+from dln_jax.control.optimal.value_networks import discounts_down_to, fit_hjb, value_network
 
 LINE = ControlProblem(
     lambda x: x, lambda x: jnp.ones((1, 1)), lambda x: 0.5 * x @ x, quadratic(1.0), 0.0, [-5.0], [5.0], (), [0.0]

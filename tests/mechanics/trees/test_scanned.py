@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from dln_jax.mechanics.trees.description import make_tree
-from dln_jax.mechanics.trees.recursions import newton_euler
-from dln_jax.mechanics.trees.scanned import scanned_forces, scanned_regressor
+from dln_jax.mechanics.trees.recursions import newton_euler, scanned_forces, scanned_regressor
 
 KINDS = ("revolute", "prismatic", "revolute")
 
