@@ -25,9 +25,8 @@ from dln_jax.softbody.step_parts import balance, conclude, initial_state, step_p
 from dln_jax.softbody.substeps import with_shorter_steps
 from dln_jax.softbody.verdict import TOLERANCE, Info, trusted, verdict_on_positions
 from dln_jax.solvers.elements.assembly import pattern
-from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory
+from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory, known_data, least_work
 from dln_jax.solvers.elements.minimise import minimise
-from dln_jax.solvers.elements.selection import known_data, least_work
 from dln_jax.types import InputError, require_positive
 
 Step = Callable[..., tuple[Any, Info]]

@@ -43,10 +43,9 @@ from dln_jax.softbody.verdict import (
 )
 from dln_jax.solvers.elements.assembly import pattern
 from dln_jax.solvers.elements.energies import Corners, ElementEnergy, local, value
-from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory
+from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory, known_data, least_work
 from dln_jax.solvers.elements.minimise import minimise
 from dln_jax.solvers.elements.moving import MovingEnergy, lists_between, moving_gradient
-from dln_jax.solvers.elements.selection import known_data, least_work
 from dln_jax.solvers.newton import SolverInfo
 from dln_jax.types import InputError, require_positive
 

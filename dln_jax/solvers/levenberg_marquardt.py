@@ -120,7 +120,7 @@ def run(
     """Runs `iterations` iterations, fewer if the status changes or one lowers F by no more than `improvement` F.
 
     States with a leading axis of seeds run one after the other, not in lockstep: no seed repeats the failed trials of
-    another, memory is that of one seed, and LAPACK is never called for a batch (see `solvers.lapack`).
+    another, memory is that of one seed, and LAPACK is never called for a batch (see `solvers.elimination`).
 
     Raises:
         InputError: parameters or residuals are not float64, or arrays differ in length.

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from dln_jax.solvers.lapack import cholesky, symmetric_eigen
+from dln_jax.solvers.elimination import cholesky, symmetric_eigen
 
 # Largest number of elements that are decomposed at a time.
 _DECOMPOSED = 64

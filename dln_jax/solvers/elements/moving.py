@@ -20,7 +20,7 @@ from dln_jax.solvers.elements.assembly import Pattern
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, square
 from dln_jax.solvers.elements.linear_solvers import LinearSolver, lookup, sparse, summed_products, with_constants
 from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients
-from dln_jax.solvers.lapack import cholesky, substitute, symmetric_eigen
+from dln_jax.solvers.elimination import cholesky, substitute, symmetric_eigen
 
 _DENSE_UNKNOWNS = 1000
 """Largest systems that are solved densely: a factorisation of this size takes about as long as assembling it."""

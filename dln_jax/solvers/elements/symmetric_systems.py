@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from dln_jax.solvers.lapack import cholesky, substitute
+from dln_jax.solvers.elimination import cholesky, substitute
 
 Vector = Float[Array, "..."]
 Factor = tuple[Float[Array, "count s s"], Float[Array, "count s s"]]
