@@ -54,7 +54,7 @@ def jacobian_bytes(parameters: Any, samples: int, residuals: int, *, chunk_size:
     Intermediate values of the residual function itself, for `chunk_size` samples, come on top.
     """
     size = count(parameters)
-    piece = size * min(chunk_size, samples) * (1 if _reverse_is_cheaper(size, residuals) else residuals)
+    piece = size * min(chunk_size, samples) * (1 if residuals < size else residuals)
     return 8 * (4 * size**2 + piece + (size * samples * residuals if keep else 0))
 
 
@@ -133,7 +133,7 @@ def normal_equations(
         samples, weights = chunk
         residuals, pull_back = jax.vmap(one)(*samples)
         rows = residuals.shape[1]
-        if not _reverse_is_cheaper(size, rows):
+        if rows >= size:
             weights = jnp.tile(weights, rows)
             sums, jacobian = add(sums, forward(samples), residuals.T.ravel(), weights)
             return sums, None if jacobian is None else jacobian[None]
@@ -229,7 +229,3 @@ def solve(factor: ScaledFactor, b: Float[Array, "P"]) -> Float[Array, "P"]:
     lower, scaling = factor
     forward = solve_triangular(lower, scaling * b, lower=True)
     return scaling * solve_triangular(lower, forward, lower=True, trans="T")
-
-
-def _reverse_is_cheaper(parameters: int, residuals: int) -> bool:
-    return residuals < parameters
