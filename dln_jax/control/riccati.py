@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from dln_jax.solvers.lapack import cholesky, substitute
+from dln_jax.solvers.elimination import cholesky, substitute
 
 
 class Horizon(NamedTuple):

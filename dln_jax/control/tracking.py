@@ -32,7 +32,7 @@ from jaxtyping import Bool, Float
 from dln_jax.control.state_space import where_finite
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.dynamics import Dynamics, InverseForward
-from dln_jax.solvers.lapack import cholesky
+from dln_jax.solvers.elimination import cholesky
 from dln_jax.types import InputError, Vector, require_positive
 
 GAIN = 0.9

@@ -1,6 +1,6 @@
 """Friction and inertias of a rigid tree by least squares.
 
-    tau = Phi(q, qd, qdd) theta + Sᵀ F(S qd, T; shape) c,   over theta, c and shape: `solvers.separable`
+    tau = Phi(q, qd, qdd) theta + Sᵀ F(S qd, T; shape) c,   over theta, c and shape: `solvers.least_squares`
 
 The nonlinear unknowns are the logarithms of velocities and slopes, log(μ / (1 - μ)) for a load share μ, and the shift
 of a sigmoid and the cooling of viscous friction themselves (`UNKNOWNS`). With load, rows of Phi (at the motors) are
@@ -32,7 +32,7 @@ from dln_jax.mechanics.trees.recursions import regressor
 from dln_jax.models.model import Model
 from dln_jax.models.trees import WARM, RigidTreeParameters, Rows, make_rigid_tree
 from dln_jax.precision import compiled
-from dln_jax.solvers.separable import SeparableSolution, solve_separable
+from dln_jax.solvers.least_squares import SeparableSolution, solve_separable
 from dln_jax.types import FrictionLaw, InputError, JointVector
 
 FIRST_LOAD = 0.05

@@ -40,11 +40,11 @@ from dln_jax.locomotion.task import (
     advance,
     beginning,
     change_of,
-    chosen,
     observe,
     walk,
 )
 from dln_jax.scale import shares, spread
+from dln_jax.softbody.substeps import where
 from dln_jax.types import InputError, require_positive
 
 WIDTH = 64
@@ -219,14 +219,18 @@ def make_updates(
     def update(state: GradientState, _: None) -> tuple[GradientState, None]:
         key = jax.random.fold_in(jax.random.key(state.seed), state.updates)
         for_noise, for_starts = jax.random.split(key)
-        noise = _opposite_pairs(for_noise, state.parameters, lanes)
+        leaves, structure = jax.tree.flatten(state.parameters)
+        keys = zip(leaves, jax.random.split(for_noise, len(leaves)), strict=True)
+        halves = [jax.random.normal(key, (lanes // 2, *leaf.shape), leaf.dtype) for leaf, key in keys]
+        # Lanes of a pair have opposite noise.
+        noise = structure.unflatten([jnp.concatenate([half, -half]) for half in halves])
         (gradients, finite), (ends, seen, rewards, alive) = descents(
             (state.parameters, state.followed), (noise, state.lanes)
         )
         gradient = jax.tree.map(lambda of_lanes: of_lanes.sum(axis=0) / jnp.maximum(finite.sum(), 1), gradients)
         change, moments = optimiser.update(gradient, state.optimiser, state.parameters)
         moved = optax.apply_updates(state.parameters, change)
-        parameters, moments = chosen(finite.any(), (moved, moments), (state.parameters, state.optimiser))
+        parameters, moments = where(finite.any(), (moved, moments), (state.parameters, state.optimiser))
         # The first averages cover few updates, so that they forget the initial parameters.
         kept = jnp.minimum(settings.average, (1.0 + state.updates) / (10.0 + state.updates))
         averaged = optax.incremental_update(parameters, state.averaged, 1.0 - kept)
@@ -249,7 +253,7 @@ def make_updates(
         followed = optax.incremental_update(value, state.followed, settings.following)
         over = (ends.steps >= task.episode) | (alive[:, -1] == 0)
         starts = jax.vmap(lambda key: beginning(task, key))(jax.random.split(for_starts, lanes))
-        places = jax.vmap(chosen)(over, starts, ends)
+        places = jax.vmap(where)(over, starts, ends)
         skipped = state.skipped + (~finite.all()).astype(state.skipped.dtype)
         learned = parameters, averaged, moments, value, value_moments, followed, places
         return GradientState(*learned, state.seed, state.updates + 1, skipped), None
@@ -273,11 +277,3 @@ def targets(
         return target, target
 
     return jax.lax.scan(back, values[-1], (alive[:-1] * rewards, values[1:]), reverse=True)[1]
-
-
-def _opposite_pairs(key: Array, parameters: Parameters, lanes: int) -> Parameters:
-    """Returns normal noise of the parameters' shape for every lane; lanes of a pair have opposite noise."""
-    leaves, structure = jax.tree.flatten(parameters)
-    keys = jax.random.split(key, len(leaves))
-    halves = [jax.random.normal(k, (lanes // 2, *leaf.shape), leaf.dtype) for k, leaf in zip(keys, leaves, strict=True)]
-    return structure.unflatten([jnp.concatenate([half, -half]) for half in halves])

@@ -19,7 +19,7 @@ ends the episode; distance after it does not count, since tall bodies would go f
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -200,7 +200,10 @@ def observe(task: LocomotionTask, place: EpisodeState) -> Float[Array, " o"]:
     rest, x = jnp.asarray(task.creature.mesh.vertices, place.state.x.dtype), place.state.x
     R, rest_R = axes_of(task.frame, x), axes_of(task.frame, rest)
     moved = (x - task.frame.origin @ x) @ R.T - (rest - task.frame.origin @ rest) @ rest_R.T
-    up = _up(task, place)
+    gravity = place.world.gravity
+    if gravity is None:
+        gravity = task.scene.params.terms["gravity"].acceleration
+    up = -gravity / jnp.linalg.norm(gravity)
     directions = [R @ up]
     if len(up) == 3:
         ahead = jnp.eye(3, dtype=x.dtype)[0] - up[0] * up
@@ -220,7 +223,11 @@ def advance(task: LocomotionTask, place: EpisodeState, change: Float[Array, " k"
     start = pushed(place.world, place.state, place.steps)
     state, info = task.stepper.step(params_of(task, place.world), start, actuation)
     travelled = (state.x[:, 0].mean() - start.x[:, 0].mean()) / task.length
-    cosine, lowered = _posture(task, state.x)
+    rest = jnp.asarray(task.creature.mesh.vertices, state.x.dtype)
+    # How far the body has crouched, 0 to 5.
+    lowered = jnp.maximum(0.0, CROUCHED - state.x[:, -1].mean() / rest[:, -1].mean()) / (1.0 - CROUCHED)
+    # The axis of the body's frame that points up at rest.
+    cosine = axes_of(task.frame, rest)[:, -1] @ axes_of(task.frame, state.x)[:, -1]
     tilt = jnp.arccos(jnp.clip(jax.lax.stop_gradient(cosine), -1.0, 1.0))
     worth = task.speed * jnp.tanh(travelled / task.speed) if task.speed else travelled
     reward = worth - task.upright * (1.0 - cosine + lowered**2) - FALL * (tilt > FALLEN)
@@ -277,27 +284,6 @@ def judged(seen: Walk) -> tuple[Float[Array, ""], Int[Array, ""]]:
     standing = jnp.cumsum(seen.tilt > FALLEN) == 0
     usable = jnp.where((seen.converged | ~standing).all(), 1.0, jnp.nan)
     return usable * jnp.sum(jnp.where(standing, seen.travelled, 0.0)), standing.sum()
-
-
-def chosen(condition: Any, new: Any, old: Any) -> Any:
-    """Selects one of two trees of arrays."""
-    return jax.tree.map(lambda new, old: jnp.where(condition, new, old), new, old)
-
-
-def _up(task: LocomotionTask, place: EpisodeState) -> Float[Array, " dim"]:
-    gravity = place.world.gravity
-    if gravity is None:
-        gravity = task.scene.params.terms["gravity"].acceleration
-    return -gravity / jnp.linalg.norm(gravity)
-
-
-def _posture(task: LocomotionTask, x: Float[Array, "n dim"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Returns the cosine of the tilt, and how far the body has crouched, 0 to 5."""
-    rest = jnp.asarray(task.creature.mesh.vertices, x.dtype)
-    lowered = jnp.maximum(0.0, CROUCHED - x[:, -1].mean() / rest[:, -1].mean()) / (1.0 - CROUCHED)
-    # The axis of the body's frame that points up at rest.
-    cosine = axes_of(task.frame, rest)[:, -1] @ axes_of(task.frame, x)[:, -1]
-    return cosine, lowered
 
 
 def fitted_frame(vertices: Float[np.ndarray, "n dim"]) -> Frame:

@@ -23,7 +23,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from dln_jax.softbody.contact.barrier import Contact
 from dln_jax.softbody.contact.bodies import body_contact
 from dln_jax.softbody.mesh.mesh import Mesh, boundary, lumped_masses, vertices_where
 from dln_jax.softbody.mesh.shapes import Creature, body_length, box, crawler, disc, quadratic, with_midsides
@@ -126,9 +125,8 @@ def beam(
     if held is None:
         left, extent = mesh.vertices[:, 0].min(), np.ptp(mesh.vertices[:, 0])
         held = vertices_where(mesh, lambda x: x[:, 0] <= left + 1e-9 * extent)
-    scene = _solid(
-        mesh, _Law(strain_energy, youngs_modulus, poisson_ratio, mixed, contact), gravity(mesh), *loads(mesh), held=held
-    )
+    law = strain_energy, youngs_modulus, poisson_ratio, mixed
+    scene = _solid(mesh, *law, contact, gravity(mesh), *loads(mesh), held=held)
     return Example(scene, dt=1 / 60, seconds=6.0, moments=(0.0, 0.4, 0.7, 1.0))
 
 
@@ -150,7 +148,7 @@ def twist(
     """
     mesh = _of_order(box((1.0, 8.0, 1.0), (cells, 8 * cells, cells)), order)
     held = vertices_where(mesh, lambda x: (x[:, 1] == 0.0) | (x[:, 1] == 8.0))
-    scene = _solid(mesh, _Law(strain_energy, youngs_modulus, poisson_ratio, mixed, contact), held=held)
+    scene = _solid(mesh, strain_energy, youngs_modulus, poisson_ratio, mixed, contact, held=held)
     x, y, z = (mesh.vertices[held] - [0.5, 0.0, 0.5]).T
 
     def path(t: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T k dim"]:
@@ -178,7 +176,7 @@ def slope(
     normal = np.array([-along[1], along[0]])
     mesh = mesh._replace(vertices=mesh.vertices[:, :1] * along + mesh.vertices[:, 1:] * normal)
     ground = _ground(mesh, friction, height=0.5, normal=normal)
-    scene = _solid(mesh, _Law(strain_energy, youngs_modulus, poisson_ratio, mixed), gravity(mesh), ground)
+    scene = _solid(mesh, strain_energy, youngs_modulus, poisson_ratio, mixed, False, gravity(mesh), ground)
     return Example(scene, dt=1 / 120, seconds=2.0, ground=SLOPE, moments=(0.0, 0.7, 1.2, 1.6, 2.0))
 
 
@@ -212,8 +210,8 @@ def drop(
     lift[-1] = height - mesh.vertices[:, -1].min()
     mesh = mesh._replace(vertices=mesh.vertices + lift)
     ground = _ground(mesh, friction, height=height, normal=np.eye(mesh.dimension)[-1])
-    law = _Law(strain_energy, youngs_modulus, poisson_ratio, mixed, contact)
-    scene = _solid(mesh, law, gravity(mesh), ground, *loads(mesh))
+    law = strain_energy, youngs_modulus, poisson_ratio, mixed
+    scene = _solid(mesh, *law, contact, gravity(mesh), ground, *loads(mesh))
     arms = mesh.vertices - np.average(mesh.vertices, axis=0, weights=np.asarray(scene.params.masses))
     v = np.zeros_like(arms)
     v[:, 0], v[:, -1] = arms[:, -1], -arms[:, 0]
@@ -246,29 +244,25 @@ EXAMPLES: dict[str, Callable[..., Example]] = {scene.__name__: scene for scene i
 """Examples by name; their keyword arguments are their options."""
 
 
-class _Law(NamedTuple):
-    """Material and kind of elements."""
-
-    strain_energy: StrainEnergy
-    youngs_modulus: Numbers
-    poisson_ratio: float
-    mixed: bool
-    contact: bool = False
-    """Contact between and within the bodies of the mesh."""
-
-
-def _solid(mesh: Mesh, law: _Law, *others: Term, held: ArrayLike = ()) -> SoftScene:
-    density, modulus, ratio, mixed, touching = law
-    material = elastic(mesh, density, youngs_modulus=modulus, poisson_ratio=ratio, mixed=mixed)
-    contacts = [_contact(mesh, float(np.min(modulus)))] if touching else []
+def _solid(
+    mesh: Mesh,
+    strain_energy: StrainEnergy,
+    youngs_modulus: Numbers,
+    poisson_ratio: float,
+    mixed: bool,
+    contact: bool,
+    *others: Term,
+    held: ArrayLike = (),
+) -> SoftScene:
+    """Builds the scene, with `contact` of all surfaces within a tenth of the boundary's shortest edge."""
+    material = elastic(mesh, strain_energy, youngs_modulus=youngs_modulus, poisson_ratio=poisson_ratio, mixed=mixed)
+    contacts = []
+    if contact:
+        corners = mesh.vertices[boundary(mesh)]
+        distance = 0.1 * float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).min())
+        stiffness = 0.1 * float(np.min(youngs_modulus))
+        contacts = [body_contact(mesh, distance=distance, stiffness=stiffness, friction=CONTACT_FRICTION)]
     return make_scene(mesh, [material, *others], density=DENSITY, held=held, contacts=contacts)
-
-
-def _contact(mesh: Mesh, youngs_modulus: float) -> Contact:
-    """Contact of all surfaces, within a tenth of the boundary's shortest edge."""
-    corners = mesh.vertices[boundary(mesh)]
-    shortest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).min()
-    return body_contact(mesh, distance=0.1 * float(shortest), stiffness=0.1 * youngs_modulus, friction=CONTACT_FRICTION)
 
 
 def _ground(mesh: Mesh, friction: float, *, height: float, normal: np.ndarray) -> Term:

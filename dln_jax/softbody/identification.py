@@ -20,9 +20,8 @@ from jaxtyping import Array, Float
 from dln_jax.precision import quick_compilation
 from dln_jax.rollout import rollout
 from dln_jax.scale import local, program, spread
-from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.scene import Params, SoftScene
-from dln_jax.softbody.step import Stepper
+from dln_jax.softbody.step import Stepper, static_solve
 from dln_jax.types import require_positive
 
 

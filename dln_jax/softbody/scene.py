@@ -138,21 +138,15 @@ def make_scene(
     masses = lumped_masses(mesh, density) if masses is None else np.broadcast_to(np.asarray(masses, float), n)
     if len(bad := np.flatnonzero(~(np.isfinite(masses) & (masses > 0)))):
         raise InputError(f"the mass of vertex {bad[0]} is {masses[bad[0]]} kg; expected a positive number")
-    if contacts:
-        require_apart(mesh, mesh.vertices)
+    if contacts and (pairs := crossings(mesh, mesh.vertices)):
+        one, other = map(list, pairs[0])
+        raise InputError(
+            f"{len(pairs)} pair(s) of the surface cross, the first with the vertices {one} and {other}; "
+            "move the bodies apart, or leave out their contact"
+        )
     parameters = {part.name: part.parameters for part in (*terms, *contacts)}
     params = Params(jnp.asarray(mesh.vertices), jnp.asarray(masses), parameters)
     return SoftScene(mesh, terms, held, params, tuple(contacts))
-
-
-def require_apart(mesh: Mesh, x: Float[np.ndarray, "n dim"]) -> None:
-    """Refuses positions with crossing surfaces, naming the first pair by its vertices."""
-    if pairs := crossings(mesh, x):
-        (one, other), count = pairs[0], len(pairs)
-        raise InputError(
-            f"{count} pair(s) of the surface cross, the first with the vertices {list(one)} and {list(other)}; "
-            "move the bodies apart, or leave out their contact"
-        )
 
 
 def with_parameters(params: Params, **terms: Mapping[str, Any]) -> Params:

@@ -1,9 +1,12 @@
-"""Implicit time steps that minimise the potential of `integrators` (Rojas et al. 2021; Martin et al. 2011)."""
+"""Implicit time steps that minimise the potential of `integrators` (Rojas et al. 2021; Martin et al. 2011), and static
+equilibria: minima of the potential without inertia.
+"""
 
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -12,12 +15,18 @@ from dln_jax.softbody.scene import (
     Params,
     SoftScene,
     State,
+    contact_energies,
+    element_energies,
+    prepare,
+    prepare_contacts,
     with_parameters,
 )
 from dln_jax.softbody.step_parts import balance, conclude, initial_state, step_problem
 from dln_jax.softbody.substeps import with_shorter_steps
-from dln_jax.softbody.verdict import TOLERANCE, Info
-from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory
+from dln_jax.softbody.verdict import TOLERANCE, Info, trusted, verdict_on_positions
+from dln_jax.solvers.elements.assembly import pattern
+from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory, known_data, least_work
+from dln_jax.solvers.elements.minimise import minimise
 from dln_jax.types import InputError, require_positive
 
 Step = Callable[..., tuple[Any, Info]]
@@ -126,3 +135,47 @@ def moved(scene: SoftScene, params: Params, state: State, motion: Motion | None,
 def positions_and_convergence(state: State, info: Info) -> tuple[Array, Array]:
     """Returns x [n, dim] and whether the step converged, for `rollout`."""
     return state.x, info.converged
+
+
+def static_solve(
+    scene: SoftScene,
+    params: Params,
+    control: Any = None,
+    *,
+    x: Any = None,
+    tolerance: float = TOLERANCE,
+    iterations: int = 200,
+    linear_solver: LinearSolverFactory | None = None,
+    definite: bool = False,
+) -> tuple[Float[Array, "n dim"], Info]:
+    """Returns positions [n, dim] of an equilibrium, a minimum of the potential near x (default: rest shape), and Info.
+
+    Args:
+        scene: the body; without held vertices or springs to the world the minimum is not unique.
+        control: actuation, for scenes with actuators.
+        x: initial positions; held vertices stay there.
+        tolerance, iterations, linear_solver, definite: as for `make_step`.
+    """
+    x = params.rest if x is None else x
+    data = prepare(scene, params, x, control=control)
+    energies, (count, dimension) = element_energies(scene), scene.mesh.vertices.shape
+    at = pattern(energies, count, dimension, scene.free)
+    known = known_data((params, x, control), lambda: data)
+    solver = (linear_solver or least_work(energies, at, x, known))(energies, at)
+    contact = prepare_contacts(scene, params, x)
+    x, outcome = minimise(
+        energies,
+        x,
+        data,
+        free=scene.free,
+        scale=params.masses,
+        tolerance=tolerance,
+        iterations=iterations,
+        linear_solver=lambda *_: solver,
+        at=at,
+        definite=definite,
+        moving=contact_energies(scene),
+        moving_data=contact,
+    )
+    info = verdict_on_positions(scene, *jax.lax.stop_gradient((params, x, outcome)), contact)
+    return trusted(x, info.converged), info

@@ -38,14 +38,6 @@ class Parts(NamedTuple):
     """Number of parts."""
 
 
-class _Progress(NamedTuple):
-    state: State
-    info: Info
-    parts: Parts
-    done: Int[Array, ""]
-    length: Int[Array, ""]
-
-
 def with_shorter_steps(advance: Advance, dt: Any, halvings: int) -> Callable[..., tuple[State, Info]]:
     """Returns the step (params, state, control=None) -> (state, Info) that divides itself.
 
@@ -68,34 +60,31 @@ def with_shorter_steps(advance: Advance, dt: Any, halvings: int) -> Callable[...
         first, info = part_of(params, state, control, jnp.asarray(most))
         blank = jnp.zeros((most, *state.x.shape), state.x.dtype)
         parts = Parts(blank, blank, blank, jnp.zeros(most, int), jnp.asarray(0))
-        start = _Progress(
-            _where(info.converged, first, state),
-            info,
-            _with_part(parts, state, first.x, jnp.asarray(most), info.converged),
-            jnp.where(info.converged, most, 0),
-            jnp.asarray(most // 2),
-        )
+        parts = _with_part(parts, state, first.x, jnp.asarray(most), info.converged)
+        reached, done = where(info.converged, first, state), jnp.where(info.converged, most, 0)
 
-        def unfinished(progress: _Progress) -> Array:
-            return (progress.done < most) & (progress.length > 0)
+        def unfinished(progress: tuple[Any, ...]) -> Array:
+            *_, done, length = progress
+            return (done < most) & (length > 0)
 
-        def attempt(progress: _Progress) -> _Progress:
+        def attempt(progress: tuple[Any, ...]) -> tuple[Any, ...]:
             state, so_far, parts, done, length = progress
             after, outcome = part_of(params, state, control, length)
             accepted = outcome.converged
-            merged = _where(parts.taken > 0, _together(so_far, outcome), outcome)
-            return _Progress(
-                _where(accepted, after, state),
-                _where(accepted, merged, so_far)._replace(iterations=so_far.iterations + outcome.iterations),
+            merged = where(parts.taken > 0, _together(so_far, outcome), outcome)
+            return (
+                where(accepted, after, state),
+                where(accepted, merged, so_far)._replace(iterations=so_far.iterations + outcome.iterations),
                 _with_part(parts, state, after.x, length, accepted),
                 jnp.where(accepted, done + length, done),
                 jnp.where(accepted, length, length // 2),
             )
 
-        last = jax.lax.while_loop(unfinished, attempt, start)
-        complete = last.done == most
-        info = _where(complete, last.info, info._replace(iterations=last.info.iterations))
-        return _where(complete, last.state, first), info._replace(substeps=last.parts.taken), last.parts
+        start = reached, info, parts, done, jnp.asarray(most // 2)
+        reached, so_far, parts, done, _ = jax.lax.while_loop(unfinished, attempt, start)
+        complete = done == most
+        info = where(complete, so_far, info._replace(iterations=so_far.iterations))
+        return where(complete, reached, first), info._replace(substeps=parts.taken), parts
 
     def derivative(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
         state, info, parts = whole(*primals)
@@ -167,7 +156,7 @@ def _chain(most: int, count: Array, tangent: Callable, cotangent: Callable, inpu
 
         def one(moved: Any, number: Array) -> tuple[Any, None]:
             # Empty parts would divide by their length, which is zero.
-            return _where(number < count, tangent(jnp.minimum(number, count - 1), inputs[0], moved), moved), None
+            return where(number < count, tangent(jnp.minimum(number, count - 1), inputs[0], moved), moved), None
 
         moved, _ = jax.lax.scan(one, inputs[1], jnp.arange(most))
         return ravel_pytree((inputs, jax.tree.map(jnp.subtract, out, moved)))[0]
@@ -217,5 +206,6 @@ def _together(first: Info, second: Info) -> Info:
     )
 
 
-def _where(condition: Array, new: Any, old: Any) -> Any:
+def where(condition: Array, new: Any, old: Any) -> Any:
+    """Selects one of two trees of arrays."""
     return jax.tree.map(lambda new, old: jnp.where(condition, new, old), new, old)

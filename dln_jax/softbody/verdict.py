@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from dln_jax.softbody.mesh.simplices import volume_ratios
 from dln_jax.softbody.scene import Growth, Params, SoftScene, element_energies, least_distance
 from dln_jax.solvers.elements.energies import ElementEnergy, value
+from dln_jax.solvers.elements.moving import MovingEnergy, moving_gradient
 from dln_jax.solvers.newton import SolverInfo
 
 TOLERANCE = 1e-6
@@ -63,16 +64,9 @@ class Info(NamedTuple):
     """Whether lists of contact pairs were too short: the step does not converge and needs a larger `capacity`."""
 
 
-class Balance(NamedTuple):
-    """Energies of one step, in J."""
-
-    growth: Float[Array, ""]
-    at_hand: Float[Array, ""]
-    unclear: Float[Array, ""]
-    """Part of the energy at hand due to rounding and to the work of the residual forces."""
-
-
-def energy_balance(
+def verdict_on_energies(
+    info: Info,
+    before: Growth | None,
     scene: SoftScene,
     masses: Float[Array, " n"],
     data: Sequence[Any],
@@ -81,10 +75,12 @@ def energy_balance(
     work: Float[Array, ""],
     outcome: SolverInfo,
     contact: Float[Array, "2"] | float,
-) -> Balance:
-    """Returns the energies of a step.
+) -> tuple[Info, Growth | None]:
+    """Adds the verdict on energies; returns the outcome, and the energy created so far if the state carries it.
 
     Args:
+        info: the verdict on positions.
+        before: energy created before the step.
         scene: its terms and free vertices.
         masses: in kg.
         data: data of the terms' elements in this step.
@@ -98,14 +94,10 @@ def energy_balance(
     # One trace for both: the energies are most of the verdict's program.
     stored, stored_after = contact + jax.vmap(lambda at: value(energies, at, data))(jnp.stack(x))
     noise = 0.0 if outcome.energy_noise is None else outcome.energy_noise
+    # The part of the energy at hand due to rounding and to the work of the residual forces.
     unclear = noise + outcome.residual * jnp.sum(masses[:, None] * jnp.abs(x[1] - x[0]))
     growth = after - kinetic + (stored_after - stored) - work
-    return Balance(growth, kinetic + jnp.maximum(stored - stored_after, 0) + jnp.abs(work) + unclear, unclear)
-
-
-def with_energies(info: Info, balance: Balance, before: Growth | None) -> tuple[Info, Growth | None]:
-    """Adds the verdict on energies; returns the outcome, and the energy created so far if the state carries it."""
-    growth, at_hand, unclear = balance
+    at_hand = kinetic + jnp.maximum(stored - stored_after, 0) + jnp.abs(work) + unclear
     sound, so_far = growth <= LARGEST_GROWTH * at_hand, None
     if before is not None:
         created = jnp.maximum(before.created + growth - unclear, 0)
@@ -132,24 +124,41 @@ def work_of_held(
     return jax.jvp(lambda x: value(near, x, their_data), (x,), (along,))[1]
 
 
-def least_J(scene: SoftScene, params: Params, x: Float[Array, "n dim"]) -> Float[Array, ""] | None:
-    """Returns the smallest J (at quadrature points if quadratic); `None` if no term acts on the mesh's elements."""
-    elements = scene.mesh.nodes
-    if not len(elements) or not any(np.array_equal(term.indices, elements) for term in scene.terms):
-        return None
-    return jnp.min(volume_ratios(x, params.rest, elements))
+def friction_change(
+    scene: SoftScene,
+    energies: Sequence[ElementEnergy],
+    moving: Sequence[MovingEnergy],
+    x: Float[Array, "n dim"],
+    before: Any,
+    after: Any,
+) -> Float[Array, ""]:
+    """Returns the largest change of friction at x between the data of two steps, as force per mass in m/s²."""
+    # The first energy is inertia.
+    lagged = [number for number, term in enumerate(scene.terms, start=1) if term.lagged]
+    rubs = [energy in contact.friction for contact in scene.contacts for energy in contact.energies]
+    sliding = [number for number, has in enumerate(rubs) if has]
+
+    def forces(step: Any) -> Array:
+        slope = jnp.zeros_like(x)
+        if lagged:
+            rubbing, own = [energies[number] for number in lagged], [step.energies[number] for number in lagged]
+            slope += jax.grad(lambda x: value(rubbing, x, own))(x)
+        chosen, data = [moving[number] for number in sliding], [step.moving[number] for number in sliding]
+        lists = tuple(energy.elements(x, slope, of) for energy, of in zip(chosen, data, strict=True))
+        return slope + moving_gradient(chosen, x, lists, data)[1]
+
+    change = jnp.abs(forces(after) - forces(before)) / scene.params.masses[:, None]
+    return jnp.max(jnp.where(scene.free, change, 0))
 
 
 def verdict_on_positions(
-    scene: SoftScene,
-    params: Params,
-    x: Array,
-    outcome: SolverInfo,
-    contact: Sequence[Any],
+    scene: SoftScene, params: Params, x: Array, outcome: SolverInfo, contact: Sequence[Any]
 ) -> Info:
     """Combines the solver's verdict with that on the positions: no element may be inverted."""
-    least = least_J(scene, params, x)
-    converged = outcome.converged if least is None else outcome.converged & (least > 0)
+    elements, least, converged = scene.mesh.nodes, None, outcome.converged
+    if len(elements) and any(np.array_equal(term.indices, elements) for term in scene.terms):
+        least = jnp.min(volume_ratios(x, params.rest, elements))
+        converged &= least > 0
     return Info(
         outcome.residual,
         outcome.iterations,

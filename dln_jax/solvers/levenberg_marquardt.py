@@ -23,7 +23,6 @@ equations. Sums are reduced over devices once per iteration (P² / 2 numbers) an
 """
 
 import enum
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -121,7 +120,7 @@ def run(
     """Runs `iterations` iterations, fewer if the status changes or one lowers F by no more than `improvement` F.
 
     States with a leading axis of seeds run one after the other, not in lockstep: no seed repeats the failed trials of
-    another, memory is that of one seed, and LAPACK is never called for a batch (see `solvers.lapack`).
+    another, memory is that of one seed, and LAPACK is never called for a batch (see `solvers.elimination`).
 
     Raises:
         InputError: parameters or residuals are not float64, or arrays differ in length.
@@ -179,113 +178,76 @@ def _iterate(
     mesh: Mesh | None,
 ) -> LevenbergMarquardtState:
     """Runs one iteration of one seed, whatever its status; loops and branches depend only on sums over all devices."""
-    at = _linearise(sample_residual, state.parameters, chunks, samples, mesh)
-    largest = jnp.where(state.iteration == 0, jnp.max(jnp.diagonal(at.matrix)), state.scale)
-    finite = jnp.isfinite(at.loss) & jnp.all(jnp.isfinite(at.gradient))
-    flat = jnp.all(at.gradient == 0)
-    no, none = jnp.array(False), jnp.zeros((), int)
-    start = _Trial(jnp.zeros_like(at.x), at.loss, no, state.damping, state.growth, none, none)
-    last = lax.while_loop(
-        lambda trial: finite & ~flat & ~trial.accepted & (trial.tried < TRIALS),
-        # If no parameter has an effect, the scale is zero; any positive number will do, because the step is zero.
-        lambda trial: _try(sample_residual, at, jnp.where(largest > 0, largest, 1.0), trial, mesh),
-        start,
+    parameters = state.parameters
+    x, unravel = ravel_pytree(parameters)
+    rows = chunks.weights.size * equations.residual_count(sample_residual, parameters, chunks)
+    keep = 8 * x.size * rows <= KEPT_BYTES
+    matrix, gradient, squares, jacobian = equations.normal_equations(
+        sample_residual, parameters, chunks, keep=keep, mesh=mesh
     )
-    stalled = jnp.where(jnp.isfinite(last.loss), int(Status.STALLED), int(Status.NON_FINITE))
+    matrix, gradient, squares = matrix / samples, gradient / samples, squares / samples
+    largest = jnp.where(state.iteration == 0, jnp.max(jnp.diagonal(matrix)), state.scale)
+    # If no parameter has an effect, the scale is zero; any positive number will do, because the step is zero.
+    scale = jnp.where(largest > 0, largest, 1.0)
+    finite = jnp.isfinite(squares) & jnp.all(jnp.isfinite(gradient))
+    flat = jnp.all(gradient == 0)
+
+    def attempt(trial: tuple[Array, ...]) -> tuple[Array, ...]:
+        """Tries the step with the current damping, and finds whether it lowers the loss, and the next damping."""
+        _, _, _, damping, growth, tried, fallbacks = trial
+        damped = damping * scale
+        factor, fell_back = equations.factorise(matrix + damped * jnp.eye(x.size))
+        velocity = -equations.solve(factor, gradient)
+
+        def accelerated(probed: Array) -> Array:
+            """Returns v + a from the residuals at x + h v."""
+            product = equations.pull_back(sample_residual, parameters, chunks, jacobian, probed, mesh=mesh)
+            slope = product / samples
+            # Finite or NaN; the selection also keeps the rounding of the division, which a fused multiply-add would
+            # skip.
+            slope = jnp.where(jnp.isfinite(slope), slope, jnp.nan)
+            bend = -equations.solve(factor, slope - (1 - PROBE) * gradient + PROBE * damped * velocity) / PROBE**2
+            bounded = bend @ bend <= UPPER_ACCELERATION**2 * (velocity @ velocity)  # False for NaN
+            return jnp.where(bounded, velocity + bend, velocity)
+
+        def evaluate(phase: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+            step, _ = carry
+            point = jnp.where(phase == 0, PROBE * velocity, step)
+            values = equations.residuals(sample_residual, unravel(x + point), chunks)
+            step = lax.cond(phase == 0, lambda: accelerated(values), lambda: step)
+            return step, total(jnp.sum(values**2), mesh) / samples
+
+        # One loop body for probe and trial: the residual function is compiled once for both.
+        step, loss = lax.fori_loop(0, 2, evaluate, (velocity, squares))
+        predicted = (damped * velocity - gradient) @ velocity
+        gain = jnp.clip((squares - loss) / predicted, 0, 1)
+        accepted = loss < squares
+        factor_on_damping = jnp.where(accepted, jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3), growth)
+        damping = jnp.maximum(damping * factor_on_damping, LOWER_DAMPING)
+        growth = jnp.where(accepted, 2.0, 2 * growth)
+        return step, loss, accepted, damping, growth, tried + 1, fallbacks + fell_back
+
+    def unfinished(trial: tuple[Array, ...]) -> Array:
+        _, _, accepted, *_, tried, _ = trial
+        return finite & ~flat & ~accepted & (tried < TRIALS)
+
+    none = jnp.zeros((), int)
+    start = jnp.zeros_like(x), squares, jnp.array(False), state.damping, state.growth, none, none
+    step, loss, accepted, damping, growth, tried, fallbacks = lax.while_loop(unfinished, attempt, start)
+    stalled = jnp.where(jnp.isfinite(loss), int(Status.STALLED), int(Status.NON_FINITE))
     status = jnp.select(
-        [~finite, flat, ~last.accepted, at.loss - last.loss <= improvement * at.loss],
+        [~finite, flat, ~accepted, squares - loss <= improvement * squares],
         [int(Status.NON_FINITE), int(Status.FLAT), stalled, int(Status.IMPROVEMENT)],
         int(Status.RUNNING),
     )
     return LevenbergMarquardtState(
-        parameters=at.unravel(jnp.where(last.accepted, at.x + last.step, at.x)),
+        parameters=unravel(jnp.where(accepted, x + step, x)),
         iteration=state.iteration + (finite & ~flat),
         status=status.astype(state.status.dtype),  # weakly typed, it would compile another program
-        loss=jnp.where(last.accepted, last.loss, at.loss),
-        damping=last.damping,
-        growth=last.growth,
+        loss=jnp.where(accepted, loss, squares),
+        damping=damping,
+        growth=growth,
         scale=largest,
-        trials=state.trials + last.tried,
-        fallbacks=state.fallbacks + last.fallbacks,
-    )
-
-
-class _Linearised(NamedTuple):
-    parameters: Any
-    x: Array
-    """The parameters as a vector [P]."""
-    unravel: Callable[[Array], Any]
-    chunks: Chunks
-    samples: int
-    """Number of samples on all devices."""
-    matrix: Array
-    """A [P, P]."""
-    gradient: Array
-    """g [P]."""
-    loss: Array
-    jacobian: Array | None
-    """Jacobian of all samples, if small enough to keep."""
-
-
-def _linearise(
-    sample_residual: SampleResidual, parameters: Any, chunks: Chunks, samples: int, mesh: Mesh | None
-) -> _Linearised:
-    x, unravel = ravel_pytree(parameters)
-    rows = chunks.weights.size * equations.residual_count(sample_residual, parameters, chunks)
-    keep = 8 * x.size * rows <= KEPT_BYTES
-    matrix, vector, squares, jacobian = equations.normal_equations(
-        sample_residual, parameters, chunks, keep=keep, mesh=mesh
-    )
-    matrix, vector, squares = matrix / samples, vector / samples, squares / samples
-    return _Linearised(parameters, x, unravel, chunks, samples, matrix, vector, squares, jacobian)
-
-
-class _Trial(NamedTuple):
-    step: Array
-    loss: Array
-    accepted: Array
-    damping: Array
-    """Damping of the next trial."""
-    growth: Array
-    tried: Array
-    fallbacks: Array
-
-
-def _try(sample_residual: SampleResidual, at: _Linearised, scale: Array, trial: _Trial, mesh: Mesh | None) -> _Trial:
-    """Tries the step with the current damping; returns whether it lowers the loss, and the next damping."""
-    damped = trial.damping * scale
-    factor, fell_back = equations.factorise(at.matrix + damped * jnp.eye(at.x.size))
-    velocity = -equations.solve(factor, at.gradient)
-
-    def accelerated(probed: Array) -> Array:
-        """Returns v + a from the residuals at x + h v."""
-        product = equations.pull_back(sample_residual, at.parameters, at.chunks, at.jacobian, probed, mesh=mesh)
-        slope = product / at.samples
-        # Finite or NaN; the selection also keeps the rounding of the division, which a fused multiply-add would skip.
-        slope = jnp.where(jnp.isfinite(slope), slope, jnp.nan)
-        bend = -equations.solve(factor, slope - (1 - PROBE) * at.gradient + PROBE * damped * velocity) / PROBE**2
-        bounded = bend @ bend <= UPPER_ACCELERATION**2 * (velocity @ velocity)  # False for NaN
-        return jnp.where(bounded, velocity + bend, velocity)
-
-    def evaluate(phase: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        step, _ = carry
-        point = jnp.where(phase == 0, PROBE * velocity, step)
-        values = equations.residuals(sample_residual, at.unravel(at.x + point), at.chunks)
-        step = lax.cond(phase == 0, lambda: accelerated(values), lambda: step)
-        return step, total(jnp.sum(values**2), mesh) / at.samples
-
-    # One loop body for probe and trial: the residual function is compiled once for both.
-    step, loss = lax.fori_loop(0, 2, evaluate, (velocity, at.loss))
-    predicted = (damped * velocity - at.gradient) @ velocity
-    gain = jnp.clip((at.loss - loss) / predicted, 0, 1)
-    accepted = loss < at.loss
-    factor_on_damping = jnp.where(accepted, jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3), trial.growth)
-    return _Trial(
-        step=step,
-        loss=loss,
-        accepted=accepted,
-        damping=jnp.maximum(trial.damping * factor_on_damping, LOWER_DAMPING),
-        growth=jnp.where(accepted, 2.0, 2 * trial.growth),
-        tried=trial.tried + 1,
-        fallbacks=trial.fallbacks + fell_back,
+        trials=state.trials + tried,
+        fallbacks=state.fallbacks + fallbacks,
     )

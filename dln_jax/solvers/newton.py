@@ -42,14 +42,6 @@ class SolverInfo(NamedTuple):
     """Moving elements at the start and at the minimum."""
 
 
-class _RootIterate(NamedTuple):
-    x: Root
-    residual: Float[Array, ""]
-    iterations: Int[Array, ""]
-    converged: Bool[Array, ""]
-    running: Bool[Array, ""]
-
-
 def find_root(
     function: Callable[..., Array], start: Root, *arguments: Any, tolerance: float = 0.0, iterations: int = 30
 ) -> tuple[Root, SolverInfo]:
@@ -74,8 +66,29 @@ def find_root(
     if not tolerance >= 0:
         raise InputError(f"tolerance is {tolerance}; expected a number >= 0 (0 for the accuracy of rounding)")
 
-    def search(residuals: Callable[[Root], Root], start: Root):
-        return _newton(residuals, start, tolerance, iterations)
+    def search(function: Callable[[Root], Root], start: Root) -> tuple[Root, tuple[Array, Array, Array]]:
+        real = start.dtype
+        rounding = _ROUNDING_UNITS * jnp.finfo(real).eps
+
+        def twice(x: Root) -> tuple[Root, Root]:
+            value = function(x)
+            return value, value
+
+        def iterate(state: tuple[Array, ...]) -> tuple[Array, ...]:
+            # One evaluation per turn both judges the point and improves it, so that the function is compiled once.
+            x, _, count, *_ = state
+            jacobian, value = jax.jacfwd(twice, has_aux=True)(x)
+            step = solve(jacobian, value)
+            residual = jnp.max(jnp.abs(value))
+            floor = rounding * jnp.max(jnp.abs(jacobian) @ jnp.abs(x))
+            converged = residual <= jnp.maximum(tolerance, floor)
+            running = ~converged & jnp.isfinite(residual) & (count + 1 < iterations)
+            return jnp.where(jnp.isfinite(step).all(), x - step, x), residual, count + 1, converged, running
+
+        first = start, jnp.asarray(jnp.inf, real), jnp.asarray(0), jnp.asarray(False), jnp.asarray(True)
+        x, residual, count, converged, _ = jax.lax.while_loop(lambda state: state[-1], iterate, first)
+        # `custom_root` accepts only real numbers as auxiliary output.
+        return x, (residual, count.astype(real), converged.astype(real))
 
     def solve_linearised(product: Callable[[Root], Root], right: Root) -> Root:
         return solve(jax.jacfwd(product)(right), right)
@@ -84,36 +97,3 @@ def find_root(
         lambda x: function(x, *arguments), start, search, solve_linearised, has_aux=True
     )
     return root, SolverInfo(residual, count.astype(int), converged > 0)
-
-
-def _newton(
-    function: Callable[[Root], Root], start: Root, tolerance: float, iterations: int
-) -> tuple[Root, tuple[Array, Array, Array]]:
-    rounding = _ROUNDING_UNITS * jnp.finfo(start.dtype).eps
-
-    def twice(x: Root) -> tuple[Root, Root]:
-        value = function(x)
-        return value, value
-
-    def iterate(state: _RootIterate) -> _RootIterate:
-        # One evaluation per turn both judges the point and improves it, so that the function is compiled once.
-        jacobian, value = jax.jacfwd(twice, has_aux=True)(state.x)
-        step = solve(jacobian, value)
-        residual = jnp.max(jnp.abs(value))
-        floor = rounding * jnp.max(jnp.abs(jacobian) @ jnp.abs(state.x))
-        converged = residual <= jnp.maximum(tolerance, floor)
-        count = state.iterations + 1
-        return _RootIterate(
-            x=jnp.where(jnp.isfinite(step).all(), state.x - step, state.x),
-            residual=residual,
-            iterations=count,
-            converged=converged,
-            running=~converged & jnp.isfinite(residual) & (count < iterations),
-        )
-
-    unknown = jnp.asarray(jnp.inf, start.dtype)
-    first = _RootIterate(start, unknown, jnp.asarray(0), jnp.asarray(False), jnp.asarray(True))
-    last = jax.lax.while_loop(lambda state: state.running, iterate, first)
-    # `custom_root` accepts only real numbers as auxiliary output.
-    real = start.dtype
-    return last.x, (last.residual, last.iterations.astype(real), last.converged.astype(real))

@@ -37,26 +37,8 @@ class Chunks(NamedTuple):
     """1 for a sample, 0 for padding, [k, c]."""
 
 
-class NormalEquations(NamedTuple):
-    """Sums over all residuals r; the caller divides by the number of samples."""
-
-    matrix: Array
-    """J Jᵀ [P, P]; read only its lower triangle."""
-    vector: Array
-    """J r [P]."""
-    squares: Array
-    """Sum of r²."""
-    jacobian: Array | None
-    """J as [k, blocks, P, rows of a block], or None if it is not kept."""
-
-
-class ScaledFactor(NamedTuple):
-    """Cholesky factor of a positive definite matrix A, scaled to unit diagonal: A = S⁻¹ L Lᵀ S⁻¹."""
-
-    lower: Array
-    """L [P, P]."""
-    scaling: Array
-    """Diagonal of S, 1 / sqrt(A_ii) [P]."""
+ScaledFactor = tuple[Float[Array, "P P"], Float[Array, "P"]]
+"""L and the diagonal 1 / sqrt(A_ii) of S of a positive definite matrix A = S⁻¹ L Lᵀ S⁻¹, scaled to unit diagonal."""
 
 
 def count(parameters: Any) -> int:
@@ -72,7 +54,7 @@ def jacobian_bytes(parameters: Any, samples: int, residuals: int, *, chunk_size:
     Intermediate values of the residual function itself, for `chunk_size` samples, come on top.
     """
     size = count(parameters)
-    piece = size * min(chunk_size, samples) * (1 if _reverse_is_cheaper(size, residuals) else residuals)
+    piece = size * min(chunk_size, samples) * (1 if residuals < size else residuals)
     return 8 * (4 * size**2 + piece + (size * samples * residuals if keep else 0))
 
 
@@ -124,8 +106,10 @@ def split(arrays: tuple[Any, ...], chunk_size: int, *, devices: int = 1) -> Chun
 
 def normal_equations(
     sample_residual: SampleResidual, parameters: Any, chunks: Chunks, *, keep: bool, mesh: Mesh | None = None
-) -> NormalEquations:
-    """Returns J Jᵀ, J r and the sum of squares at `parameters`, and the Jacobian with `keep`.
+) -> tuple[Float[Array, "P P"], Float[Array, "P"], Float[Array, ""], Array | None]:
+    """Returns J Jᵀ (read only its lower triangle), J r and the sum of r², and J with `keep`, else `None`.
+
+    The sums are over all samples; the caller divides by their number. J is [k, blocks, P, rows of a block].
 
     With a mesh, call it in a function of `scale.mesh.on_devices`: chunks and Jacobian belong to this device, the sums
     to all devices.
@@ -149,7 +133,7 @@ def normal_equations(
         samples, weights = chunk
         residuals, pull_back = jax.vmap(one)(*samples)
         rows = residuals.shape[1]
-        if not _reverse_is_cheaper(size, rows):
+        if rows >= size:
             weights = jnp.tile(weights, rows)
             sums, jacobian = add(sums, forward(samples), residuals.T.ravel(), weights)
             return sums, None if jacobian is None else jacobian[None]
@@ -176,7 +160,7 @@ def normal_equations(
     (matrix, vector, squares), jacobian = lax.scan(add_chunk, (zeros, jnp.zeros(size), jnp.zeros(())), chunks)
     matrix, vector, squares = total((matrix, vector, squares), mesh)
     lower = jnp.concatenate([jnp.pad(block, ((0, 0), (0, size - block.shape[1]))) for block in matrix])
-    return NormalEquations(lower, vector, squares, jacobian)
+    return lower, vector, squares, jacobian
 
 
 def residuals_of(sample_residual: SampleResidual, parameters: Any, samples: tuple[Any, ...]) -> Float[Array, "r c"]:
@@ -237,14 +221,11 @@ def factorise(matrix: Float[Array, "P P"]) -> tuple[ScaledFactor, Array]:
         roots = jnp.sqrt(jnp.maximum(values, smallest * values[-1]))
         return jnp.linalg.qr(roots[:, None] * vectors.T, mode="r").T
 
-    return ScaledFactor(lax.cond(well_conditioned, lambda: lower, by_eigenvalues), scaling), ~well_conditioned
+    return (lax.cond(well_conditioned, lambda: lower, by_eigenvalues), scaling), ~well_conditioned
 
 
 def solve(factor: ScaledFactor, b: Float[Array, "P"]) -> Float[Array, "P"]:
     """Returns x [P] with A x = b."""
-    forward = solve_triangular(factor.lower, factor.scaling * b, lower=True)
-    return factor.scaling * solve_triangular(factor.lower, forward, lower=True, trans="T")
-
-
-def _reverse_is_cheaper(parameters: int, residuals: int) -> bool:
-    return residuals < parameters
+    lower, scaling = factor
+    forward = solve_triangular(lower, scaling * b, lower=True)
+    return scaling * solve_triangular(lower, forward, lower=True, trans="T")

@@ -21,7 +21,7 @@ from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
 from dln_jax.scale import batch_mesh, of_first_process, spread
-from dln_jax.solvers import lapack
+from dln_jax.solvers.elimination import cholesky, solve, symmetric_eigen
 from dln_jax.types import InputError
 
 SAMPLES = 61
@@ -88,7 +88,7 @@ def continued(folder, key, name, mesh):
 
 def factors(matrix):
     """By LAPACK, which takes a batch apart on a CPU."""
-    return lapack.cholesky(matrix), lapack.symmetric_eigen(matrix), lapack.solve(matrix, matrix[0])
+    return cholesky(matrix), symmetric_eigen(matrix), solve(matrix, matrix[0])
 
 
 def main(folder, name):
@@ -102,7 +102,7 @@ def main(folder, name):
         found[key] = numbers(fit(bumps(seeds), optimiser, seconds=LONG, mesh=mesh))
         if key != "newton of three seeds":
             found[f"{key}, continued"] = numbers(continued(folder, key, name, mesh))
-    matrices = np.random.default_rng(0).normal(size=(8, 5, 5))
+    matrices = np.random.default_rng(0).normal(size=(8, 17, 17))
     matrices = matrices @ matrices.swapaxes(1, 2)
     found["factors"] = jax.jit(spread(lambda _, batch: jax.vmap(factors)(batch), mesh))(0.0, matrices)
     said = {"devices": 1 if mesh is None else mesh.size, "refusal": ""}

@@ -9,7 +9,6 @@ from impact_derivatives import require_gradient_of_differences
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import fsolve
 
-from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.mesh.mesh import NamedSet, boundary, make_mesh, volumes
 from dln_jax.softbody.mesh.shapes import beam, box, lattice, quadratic
 from dln_jax.softbody.mesh.surfaces import (
@@ -20,7 +19,7 @@ from dln_jax.softbody.mesh.surfaces import (
     surface_parts,
 )
 from dln_jax.softbody.scene import make_scene, potential, with_parameters
-from dln_jax.softbody.step import make_step
+from dln_jax.softbody.step import make_step, static_solve
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.fibres import fibres
 from dln_jax.softbody.terms.loads import body_force, gas, gravity, point_force, pressure, traction

@@ -12,12 +12,12 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import Delaunay
 
 from dln_jax.softbody import examples
-from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.mesh.files import read_mesh, write_mesh
 from dln_jax.softbody.mesh.mesh import NamedSet, lumped_masses, make_mesh, vertices_where, volumes
 from dln_jax.softbody.mesh.shapes import barycentric_split, beam, box, quadratic, with_midsides
 from dln_jax.softbody.mesh.simplices import SIDES, regularity, volume_ratios
 from dln_jax.softbody.scene import element_energies, make_scene, potential, prepare
+from dln_jax.softbody.step import static_solve
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.loads import point_force
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean

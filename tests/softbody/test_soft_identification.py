@@ -8,11 +8,10 @@ import numpy as np
 from calls import one_line
 
 from dln_jax.rollout import rollout
-from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.identification import ObservedMotions, design, identify
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.scene import make_scene, with_parameters
-from dln_jax.softbody.step import make_step, positions_and_convergence
+from dln_jax.softbody.step import make_step, positions_and_convergence, static_solve
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.loads import gravity

@@ -14,12 +14,11 @@ from calls import one_line
 from dln_jax.rollout import rollout
 from dln_jax.softbody.contact.bodies import body_contact
 from dln_jax.softbody.contact.obstacles import half_space, obstacle_contact
-from dln_jax.softbody.equilibrium import static_solve
 from dln_jax.softbody.integrators import BDF2, INTEGRATORS, MIDPOINT
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import beam, join, lattice, quadratic, translate
 from dln_jax.softbody.scene import make_scene, with_parameters
-from dln_jax.softbody.step import Motion, make_step
+from dln_jax.softbody.step import Motion, make_step, static_solve
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.fibres import fibres
 from dln_jax.softbody.terms.loads import gravity

@@ -10,11 +10,10 @@ import pytest
 from scipy.linalg import hilbert
 from test_minimise import ARGUMENTS, hanging_chain
 
-from dln_jax.solvers import lapack
 from dln_jax.solvers.elements.energies import lower_triangles, project
 from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free, sparse
 from dln_jax.solvers.elements.symmetric_systems import places, solve_bands
-from dln_jax.solvers.elimination import solve, solve_lower, solve_lower_transposed
+from dln_jax.solvers.elimination import cholesky, solve, solve_lower, solve_lower_transposed, substitute
 
 EPS = np.finfo(float).eps
 
@@ -69,7 +68,7 @@ def test_only_the_system_that_is_not_definite_is_not_finite():
     expected = [True, False] * 3 + [True]
     assert np.isfinite(of_bands(matrices, np.ones((7, 12, 1)), 3)).all(axis=(1, 2)).tolist() == expected
     nowhere = np.where(np.triu(np.ones((12, 12)), 1), np.nan, matrices)
-    lower = np.asarray(jax.jit(jax.vmap(lapack.cholesky))(nowhere))
+    lower = np.asarray(jax.jit(jax.vmap(cholesky))(nowhere))
     assert np.isfinite(lower).all(axis=(1, 2)).tolist() == expected
     np.testing.assert_allclose(lower[0] @ lower[0].T, matrices[0], atol=12 * EPS * np.abs(matrices[0]).max())
 
@@ -95,7 +94,7 @@ def test_substitution_in_nested_batches(transposed, right):
                 ]
                 return jax.vmap(jax.vmap(function, inner), outer)(*of)
 
-            ours = mapped(lambda factor, b: lapack.substitute(factor, b, transposed=transposed, right=right), factor)
+            ours = mapped(lambda factor, b: substitute(factor, b, transposed=transposed, right=right), factor)
             pairs.append((ours, mapped(lambda inverse, b: b @ inverse if right else inverse @ b, inverse)))
         return pairs
 
@@ -181,6 +180,6 @@ def test_no_batch_is_given_to_lapack(way):
 
 
 def test_elsewhere_a_batch_is_one_call():
-    mapped = jax.jit(jax.vmap(lapack.cholesky)).trace(jnp.ones((3, 40, 40)))
+    mapped = jax.jit(jax.vmap(cholesky)).trace(jnp.ones((3, 40, 40)))
     text = mapped.lower(lowering_platforms=("cuda",)).as_text()
     assert "cusolver" in text and "stablehlo.while" not in text

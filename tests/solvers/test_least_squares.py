@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from calls import one_line
 
-from dln_jax.solvers.least_squares import solve, solve_chunks
-from dln_jax.solvers.separable import solve_separable
+from dln_jax.solvers.least_squares import solve, solve_chunks, solve_separable
 
 T = np.linspace(0, 2, 200)
 RATES, SIZES = np.array([0.7, 4.0]), np.array([2.0, -3.0, 0.5])

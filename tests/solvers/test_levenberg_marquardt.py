@@ -150,13 +150,13 @@ def test_normal_equations(inputs, outputs):
         sums = equations.normal_equations(residual, parameters, chunks, keep=True)
         return sums, together(parameters), jax.jacobian(together)(parameters)
 
-    sums, values, rows = jax.tree.map(np.asarray, evaluate(parameters))
-    np.testing.assert_allclose(np.tril(sums.matrix), np.tril(rows.T @ rows), atol=1e-11)
-    np.testing.assert_allclose(sums.vector, values @ rows, atol=1e-12)
-    np.testing.assert_allclose(sums.squares, values @ values, rtol=1e-13)
+    (matrix, vector, squares, jacobian), values, rows = jax.tree.map(np.asarray, evaluate(parameters))
+    np.testing.assert_allclose(np.tril(matrix), np.tril(rows.T @ rows), atol=1e-11)
+    np.testing.assert_allclose(vector, values @ rows, atol=1e-12)
+    np.testing.assert_allclose(squares, values @ values, rtol=1e-13)
     sizes = {"samples": 12, "residuals": outputs, "chunk_size": 4}
     kept, not_kept = (jacobian_bytes(parameters, keep=keep, **sizes) for keep in (True, False))
-    assert kept - not_kept == sums.jacobian.nbytes
+    assert kept - not_kept == jacobian.nbytes
 
 
 @pytest.mark.parametrize(("gap", "falls_back"), [(0.5, True), (4.0, False)])
@@ -165,7 +165,7 @@ def test_a_factor_of_rounding_errors_is_not_used(gap, falls_back):
     correlation = 1 - gap * np.finfo(float).eps
     factor, fell_back = equations.factorise(jnp.array([[1.0, 0.0], [correlation, 1.0]]))
     assert fell_back == falls_back
-    assert np.isfinite(np.asarray(factor.lower)).all()
+    assert np.isfinite(np.asarray(factor[0])).all()
 
 
 def test_acceleration_follows_a_curved_valley(constants):

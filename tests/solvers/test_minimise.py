@@ -11,13 +11,12 @@ from scipy.optimize import minimize
 from scipy.spatial import Delaunay
 
 from dln_jax.softbody.mesh.shapes import beam, box
-from dln_jax.solvers.elements import selection
+from dln_jax.solvers.elements import linear_solvers
 from dln_jax.solvers.elements.assembly import pattern
 from dln_jax.solvers.elements.energies import ElementEnergy
-from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free, sparse
+from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, by_size, dense, least_work, matrix_free, sparse
 from dln_jax.solvers.elements.minimise import minimise
 from dln_jax.solvers.elements.moving import Elements, MovingEnergy
-from dln_jax.solvers.elements.selection import by_size, least_work
 
 SOLVERS = (dense, block_tridiagonal, sparse, matrix_free)
 CHAIN = 12
@@ -78,9 +77,9 @@ def test_factors_that_would_fill_the_memory_are_not_stored(monkeypatch):
     indices, dimension, _ = CHOICES["block"]
     energies = (ElementEnergy(spring, indices),)
     at = pattern(energies, int(indices.max()) + 1, dimension)
-    monkeypatch.setattr(selection, "_UPPER_ENTRIES", 1e3)
+    monkeypatch.setattr(linear_solvers, "_UPPER_ENTRIES", 1e3)
     assert least_work(energies, at).func is sparse
-    monkeypatch.setattr(selection, "_UPPER_TILE_ENTRIES", 1e3)
+    monkeypatch.setattr(linear_solvers, "_UPPER_TILE_ENTRIES", 1e3)
     assert least_work(energies, at) is matrix_free
 
 

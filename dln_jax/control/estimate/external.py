@@ -27,7 +27,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from dln_jax.mechanics.dynamics import Dynamics, InverseForward
-from dln_jax.solvers.lapack import symmetric_eigen
+from dln_jax.solvers.elimination import symmetric_eigen
 from dln_jax.types import InputError, Scalar, Vector, require_positive
 
 BLOCK = 1.0

@@ -199,7 +199,7 @@ def _newton_stage(
 
         def judge(step: Array, seeds: tuple[Best, LevenbergMarquardtState]) -> tuple[Best, Array]:
             best, solver = seeds
-            # One seed after the other: LAPACK calls in a score must not be batched (see `solvers.lapack`).
+            # One seed after the other: LAPACK calls in a score must not be batched (see `solvers.elimination`).
             scores = lax.map(score, solver.parameters) if problem.several else score(solver.parameters)
             better = of_seeds(better_of, (0, 0, 0, None))
             best = better(best, solver.parameters, scores[..., 0], jnp.asarray(step, jnp.int32))

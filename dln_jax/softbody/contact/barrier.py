@@ -170,11 +170,6 @@ def _mollifier(x: Float[Array, "4 3"], parallel: Float[Array, ""]) -> tuple[Arra
     )
 
 
-def _sliding_energy(x: Float[Array, "k dim"], data: tuple[Slip, Array]) -> Float[Array, ""]:
-    slip, weights = data
-    return friction_energy(weights @ x, slip)
-
-
 def _sliding_hessian(x: Float[Array, "k dim"], data: tuple[Slip, Array]) -> Float[Array, "s s"]:
     slip, weights = data
     of_point = jax.hessian(lambda point: friction_energy(point, slip))(weights @ x)
@@ -184,7 +179,7 @@ def _sliding_hessian(x: Float[Array, "k dim"], data: tuple[Slip, Array]) -> Floa
 SLIDING = MovingEnergy(
     elements=lambda x, step, data: data[0],
     describe=lambda x, elements, data: data[1],
-    gradient=jax.value_and_grad(_sliding_energy),
+    gradient=jax.value_and_grad(lambda x, data: friction_energy(data[1] @ x, data[0])),
     hessian=_sliding_hessian,
     longest=lambda x, step, elements, data: jnp.ones((), x.dtype),
 )

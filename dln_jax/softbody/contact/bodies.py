@@ -52,7 +52,7 @@ from dln_jax.softbody.contact.distances import (
     stencil_of,
 )
 from dln_jax.softbody.mesh.mesh import Mesh, components_of_vertices
-from dln_jax.softbody.terms.contact import Slip, slip_of
+from dln_jax.softbody.terms.contact import slip_of
 from dln_jax.softbody.terms.term import Context, Numbers
 from dln_jax.solvers.elements.moving import Elements, MovingEnergy
 from dln_jax.types import InputError, require_positive
@@ -116,7 +116,14 @@ def body_contact(
         data = (parameters, context.rest)
         if parameters.friction is None:
             return (data,)
-        return data, _lagged(barrier, parameters.friction, data, context, threshold_speed)
+        # The pairs in frictional contact, with normal forces at the start of the step or at `context.lag`.
+        x = context.x if context.lag is None else context.lag
+        elements = jax.lax.stop_gradient(barrier.elements(x, jnp.zeros_like(x), data))
+        pairs = barrier.describe(x, elements, data)
+        force, normal, weights = jax.vmap(normal_force)(x[elements.indices], pairs)
+        start = jnp.einsum("mk,mki->mi", weights, context.x[elements.indices])
+        slip = slip_of(context, threshold_speed, start, normal, parameters.friction * force)
+        return data, (elements, (slip, weights))
 
     def least_distance(x: Float[Array, "n dim"], elements: Elements, data: Any) -> Float[Array, ""]:
         _, kind, used = elements.data
@@ -229,15 +236,3 @@ def _longest(x: Array, step: Array, elements: Elements, data: Any) -> Array:
 
     bound = jax.vmap(speed_bound)(moved, number)
     return longest_step(distances, jnp.where(used, bound, 0))
-
-
-def _lagged(
-    barrier: MovingEnergy, friction: Array, data: Any, context: Context, threshold_speed: float
-) -> tuple[Elements, tuple[Slip, Array]]:
-    """Returns the pairs in frictional contact, with normal forces at the start of the step or at `context.lag`."""
-    x = context.x if context.lag is None else context.lag
-    elements = jax.lax.stop_gradient(barrier.elements(x, jnp.zeros_like(x), data))
-    corners = x[elements.indices]
-    force, normal, weights = jax.vmap(normal_force)(corners, barrier.describe(x, elements, data))
-    start = jnp.einsum("mk,mki->mi", weights, context.x[elements.indices])
-    return elements, (slip_of(context, threshold_speed, start, normal, friction * force), weights)

@@ -57,7 +57,11 @@ def closest(
     """
     w, e = _combined(stencil.offset, x), _combined(stencil.directions, x)
     G = summed(e[:, None, :] * e[None, :, :]) + jnp.diag(stencil.unused)
-    inverse = _inverse(G)
+    if len(G) == 1:
+        inverse = 1 / G
+    else:
+        adjugate = jnp.stack([jnp.stack([G[1, 1], -G[0, 1]]), jnp.stack([-G[1, 0], G[0, 0]])])
+        inverse = adjugate / (G[0, 0] * G[1, 1] - G[0, 1] ** 2)
     s = summed(inverse * summed(e * w))
     delta = w - summed(s[:, None] * e, axis=0)
     return delta, stencil.offset - summed(s[:, None] * stencil.directions, axis=0), e, inverse
@@ -107,13 +111,6 @@ def _inside(w: Array, e: Array, f: Array, kind: Int[Array, ""] | int) -> Array:
 def _combined(weights: Float[Array, "*rows k"], x: Float[Array, "k dim"]) -> Float[Array, "*rows dim"]:
     # A sum instead of a matrix product, which would round to fewer digits on a GPU.
     return summed(weights[..., None] * x, axis=-2)
-
-
-def _inverse(G: Float[Array, "axes axes"]) -> Float[Array, "axes axes"]:
-    if len(G) == 1:
-        return 1 / G
-    adjugate = jnp.stack([jnp.stack([G[1, 1], -G[0, 1]]), jnp.stack([-G[1, 0], G[0, 0]])])
-    return adjugate / (G[0, 0] * G[1, 1] - G[0, 1] ** 2)
 
 
 def speed_bound(p: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Float[Array, ""]:

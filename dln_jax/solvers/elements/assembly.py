@@ -94,11 +94,6 @@ def value_and_gradient(
     return total, gradient if at.free.all() else jnp.where(at.free, gradient, 0)
 
 
-def gradient(energies: Sequence[ElementEnergy], at: Pattern, x: Blocks, data: Sequence[Any]) -> Blocks:
-    """Returns dE/dx, with zeros where x is not free."""
-    return value_and_gradient(energies, at, x, data)[1]
-
-
 def assemble(corners: Int[np.ndarray, "n b valence"], components: Float[Array, "s m"]) -> Blocks:
     """Adds the components of the elements' corners to the blocks of these corners."""
     if corners.shape[2] == 1 and np.array_equal(corners[:, :, 0].T.ravel(), np.arange(components.size)):

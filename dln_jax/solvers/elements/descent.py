@@ -7,7 +7,7 @@ those of moving elements first: always projecting costs several times the iterat
 times on bodies that are pressed together. Moving elements also limit the steps.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -20,9 +20,7 @@ from dln_jax.solvers.elements.linear_solvers import LinearSolver, summed_product
 from dln_jax.solvers.elements.moving import (
     Lists,
     MovingEnergy,
-    add_diagonals,
     lists_between,
-    longest_fraction,
     moving_gradient,
     moving_hessians,
     moving_products,
@@ -71,17 +69,6 @@ class _MinimumIterate(NamedTuple):
     """Distance of fixed unknowns from the values that they approach; `None` without moving elements."""
 
 
-class _Attempt(NamedTuple):
-    """One direction of the search."""
-
-    direction: Blocks
-    descends: Bool[Array, ""]
-    number: Int[Array, ""]
-    hessians: tuple[Array, ...]
-    values: Float[Array, " entries"]
-    of_moving: tuple[Array, ...]
-
-
 def descend(
     total: Sum, x0: Blocks, data: Any, scale: Array, tolerance: float, iterations: int, start: Blocks
 ) -> tuple[Blocks, SolverInfo]:
@@ -110,11 +97,13 @@ def descend(
         values = entries(at, hessians)
         of_moving = moving_hessians(moving, x, state.lists, data[1])
         direction, forced = _direction(total, state, hessians, values, of_moving)
-        lists, direction, limit = _allowed(total, x, direction, data, state.lists)
+        lists, limit = _allowed(total, x, direction, data, state.lists)
         slope = jnp.vdot(direction, gradient)
         # Terms that cancel in a row of the gradient have the magnitude of |H| |x|.
         diagonal = jnp.take(jnp.abs(values), at.diagonal, mode="fill", fill_value=0).reshape(x.shape)
-        diagonal = add_diagonals(diagonal, state.lists, of_moving)
+        for elements, of_elements in zip(state.lists, of_moving, strict=True):
+            own = jnp.abs(jnp.diagonal(of_elements, axis1=1, axis2=2))
+            diagonal = diagonal.at[elements.indices].add(own.reshape(*elements.indices.shape, -1))
         extent = jnp.max(jnp.abs(x), initial=0)
         floor = rounding * diagonal * extent
         unclear = rounding * jnp.abs(energy) + floor.sum() * extent
@@ -122,14 +111,12 @@ def descend(
         def evaluate(x: Blocks) -> tuple[Array, Blocks]:
             return sum_and_gradient(total, x, data, lists)
 
-        point, length = _line_search(
-            evaluate, state.point, direction, slope, unclear, scale, longest=limit, any_change=forced
-        )
+        point, length = _line_search(evaluate, state.point, direction, slope, unclear, scale, limit, forced)
         gap = None if state.gap is None else (1 - length) * state.gap
         stuck = (length == 0) | overflow(lists)
         return _MinimumIterate(point, lists, floor, unclear, state.iterations + 1, stuck, gap)
 
-    lists = lists_at(total, start, data)
+    lists = lists_between(moving, start, jnp.zeros_like(start), data[1])
     first = Evaluated(start, *sum_and_gradient(total, start, data, lists))
     begin = _MinimumIterate(
         first,
@@ -149,29 +136,54 @@ def descend(
 
 
 def _direction(
-    total: Sum,
-    state: _MinimumIterate,
-    hessians: Sequence[Array],
-    values: Array,
-    of_moving: Sequence[Array],
+    total: Sum, state: _MinimumIterate, hessians: tuple[Array, ...], values: Array, of_moving: tuple[Array, ...]
 ) -> tuple[Blocks, Array]:
     """Returns Newton's direction, and whether it must be taken even if it raises the energy."""
-    right = state.point.gradient
+    _, at, solver, moving = total
+    gradient = state.point.gradient
     if state.gap is not None:
         # Fixed unknowns move by their gap; the free ones respond as the linearised forces say.
-        response = summed_products(total.energies, total.at, tuple(map(square, hessians)), state.gap)
+        response = summed_products(total.energies, at, tuple(map(square, hessians)), state.gap)
         response += moving_products(state.lists, of_moving, state.gap)
-        right += jnp.where(total.at.free, response, 0)
-    direction = _descent_direction(total, hessians, values, right, of_moving, state.lists)
+        gradient += jnp.where(at.free, response, 0)
+    shifts = jnp.asarray((*[0.0] * (2 if moving else 1), *_SHIFTS), gradient.dtype)
+
+    # A loop that usually runs once: factorisation and solve are compiled once, and vmap would always take a branch.
+    def failing(state: tuple[Any, ...]) -> Array:
+        _, descends, number, *_ = state
+        return ~descends & (number < len(shifts))
+
+    def attempt(before: tuple[Any, ...]) -> tuple[Any, ...]:
+        _, _, number, hessians, values, of_moving = before
+
+        def project_static(_: Array, before: tuple[tuple[Array, ...], Array]) -> tuple[tuple[Array, ...], Array]:
+            hessians = project(before[0], shifts[number])
+            return hessians, entries(at, hessians)
+
+        times = (number > (1 if moving else 0)).astype(int)
+        hessians, values = jax.lax.fori_loop(0, times, project_static, (hessians, values))
+        parts = values
+        if moving:
+            once = (number == 1).astype(int)
+            of_moving = jax.lax.fori_loop(0, once, lambda _, before: tuple(map(project_moving, before)), of_moving)
+            parts = (values, state.lists, of_moving)
+        direction = solver.search(solver.factorise(hessians, parts), -gradient)
+        descends = jnp.isfinite(direction).all() & (jnp.vdot(direction, gradient) <= 0)
+        return direction, descends, number + 1, hessians, values, of_moving
+
+    start = -gradient, jnp.asarray(False), jnp.asarray(0), hessians, values, of_moving
+    direction, descends, *_ = jax.lax.while_loop(failing, attempt, start)
+    direction = jnp.where(descends, direction, -gradient)
     if state.gap is None:
         return direction, jnp.asarray(False)
     return direction + state.gap, (state.gap != 0).any()
 
 
-def _allowed(total: Sum, x: Blocks, direction: Blocks, data: Any, lists: Lists) -> tuple[Lists, Blocks, Array]:
-    """Returns the elements along the direction, the direction, and the largest step that lists and energies allow."""
+def _allowed(total: Sum, x: Blocks, direction: Blocks, data: Any, lists: Lists) -> tuple[Lists, Array]:
+    """Returns the elements along the direction, and the largest step that lists and energies allow."""
+    one = jnp.ones((), x.dtype)
     if not total.moving:
-        return lists, direction, jnp.ones((), x.dtype)
+        return lists, one
 
     def too_many(state: tuple[Lists, Array, Array]) -> Array:
         lists, _, count = state
@@ -182,54 +194,11 @@ def _allowed(total: Sum, x: Blocks, direction: Blocks, data: Any, lists: Lists) 
         fraction = (1.0 / 8) ** count.astype(x.dtype)
         return lists_between(total.moving, x, fraction * direction, data[1]), fraction, count + 1
 
-    begin = lists, jnp.ones((), x.dtype), jnp.asarray(0)
-    lists, fraction, _ = jax.lax.while_loop(too_many, shorten, begin)
-    limit = fraction * longest_fraction(total.moving, x, fraction * direction, lists, data[1])
+    lists, fraction, _ = jax.lax.while_loop(too_many, shorten, (lists, one, jnp.asarray(0)))
+    step = fraction * direction
+    fractions = [m.longest(x, step, at, of) for m, at, of in zip(total.moving, lists, data[1], strict=True)]
     # If elements were left out, no step is known to be allowed.
-    return lists, direction, jnp.where(overflow(lists), 0.0, limit)
-
-
-def _descent_direction(
-    total: Sum,
-    hessians: Sequence[Array],
-    values: Array,
-    gradient: Blocks,
-    of_moving: Sequence[Array],
-    lists: Lists,
-) -> Blocks:
-    _, at, solver, moving = total
-    shifts = jnp.asarray((*[0.0] * (2 if moving else 1), *_SHIFTS), gradient.dtype)
-
-    # A loop that usually runs once: factorisation and solve are compiled once, and vmap would always take a branch.
-    def failing(state: _Attempt) -> Array:
-        return ~state.descends & (state.number < len(shifts))
-
-    def attempt(state: _Attempt) -> _Attempt:
-        number = state.number
-
-        def project_static(_: Array, before: tuple[tuple[Array, ...], Array]) -> tuple[tuple[Array, ...], Array]:
-            hessians = project(before[0], shifts[number])
-            return hessians, entries(at, hessians)
-
-        times = (number > (1 if moving else 0)).astype(int)
-        hessians, values = jax.lax.fori_loop(0, times, project_static, (state.hessians, state.values))
-        of_moving, parts = state.of_moving, values
-        if moving:
-            once = (number == 1).astype(int)
-            of_moving = jax.lax.fori_loop(0, once, lambda _, before: project_moving(before), of_moving)
-            parts = (values, lists, of_moving)
-        direction = solver.search(solver.factorise(hessians, parts), -gradient)
-        descends = jnp.isfinite(direction).all() & (jnp.vdot(direction, gradient) <= 0)
-        return _Attempt(direction, descends, number + 1, hessians, values, of_moving)
-
-    start = _Attempt(-gradient, jnp.asarray(False), jnp.asarray(0), tuple(hessians), values, tuple(of_moving))
-    last = jax.lax.while_loop(failing, attempt, start)
-    return jnp.where(last.descends, last.direction, -gradient)
-
-
-def lists_at(total: Sum, x: Blocks, data: Any) -> Lists:
-    """Returns the moving elements that act at x."""
-    return lists_between(total.moving, x, jnp.zeros_like(x), data[1])
+    return lists, jnp.where(overflow(lists), 0.0, fraction * jnp.min(jnp.stack([one, *fractions])))
 
 
 def sum_and_gradient(total: Sum, x: Blocks, data: Any, lists: Lists) -> tuple[Array, Blocks]:
@@ -248,9 +217,8 @@ def _line_search(
     slope: Float[Array, ""],
     unclear: Float[Array, ""],
     scale: Float[Array, "n 1"],
-    *,
-    longest: Float[Array, ""] | float = 1.0,
-    any_change: Bool[Array, ""] | bool = False,
+    longest: Float[Array, ""],
+    any_change: Bool[Array, ""],
 ) -> tuple[Evaluated, Float[Array, ""]]:
     """Takes the first of the steps l, l/2, l/4, ... that lowers the energy, or the gradient if rounding hides that.
 
@@ -283,10 +251,9 @@ def _line_search(
         accepted = (lower | flatter | any_change) & jnp.isfinite(energy) & jnp.isfinite(gradient).all()
         return Evaluated(x, energy, gradient), length / 2, accepted
 
-    first = jnp.asarray(longest, start.x.dtype)
-    smallest = 2.0**-_HALVINGS * first
+    smallest = 2.0**-_HALVINGS * longest
     last, length, accepted = jax.lax.while_loop(
-        lambda trial: ~trial[2] & (trial[1] > smallest), attempt, (start, first, jnp.asarray(False))
+        lambda trial: ~trial[2] & (trial[1] > smallest), attempt, (start, longest, jnp.asarray(False))
     )
     kept = [jnp.where(accepted, new, old) for new, old in zip(last, start, strict=True)]
     return Evaluated(*kept), jnp.where(accepted, 2 * length, 0)

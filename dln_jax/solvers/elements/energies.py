@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from dln_jax.solvers.lapack import cholesky, symmetric_eigen
+from dln_jax.solvers.elimination import cholesky, symmetric_eigen
 
 # Largest number of elements that are decomposed at a time.
 _DECOMPOSED = 64
@@ -44,14 +44,14 @@ class ElementEnergy(NamedTuple):
 
 def value(energies: Sequence[ElementEnergy], x: Blocks, data: Sequence[Any]) -> Float[Array, ""]:
     """Returns E(x)."""
-    terms = [_values(e, x, d).sum() for e, d in zip(energies, data, strict=True)]
-    return sum(terms, jnp.zeros((), x.dtype))
-
-
-def _values(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array, " m"]:
-    if not element.unrolled:
-        return jax.vmap(element.energy)(x[element.indices], data)
-    return _by_scalars(element.energy, *_arguments(element, x, data), x.shape[1], data)
+    total = jnp.zeros((), x.dtype)
+    for element, of in zip(energies, data, strict=True):
+        if element.unrolled:
+            values = _by_scalars(element.energy, *_arguments(element, x, of), x.shape[1], of)
+        else:
+            values = jax.vmap(element.energy)(x[element.indices], of)
+        total += values.sum()
+    return total
 
 
 def values_and_slopes(element: ElementEnergy, x: Blocks, data: Any) -> tuple[Float[Array, " m"], Float[Array, "s m"]]:
@@ -93,10 +93,7 @@ def local(element: ElementEnergy, x: Blocks) -> Any:
 
 def element_hessians(energies: Sequence[ElementEnergy], x: Blocks, data: Sequence[Any]) -> tuple[Array, ...]:
     """Returns the lower triangles of the element Hessians, by rows: [s (s + 1)/2, m] per energy, s = k b."""
-    return tuple(
-        _unrolled_hessians(e, x, of) if e.unrolled else _array_hessians(e, x, of)
-        for e, of in zip(energies, data, strict=True)
-    )
+    return tuple(_hessians(element, x, of) for element, of in zip(energies, data, strict=True))
 
 
 def square(lower: Float[Array, "entries m"]) -> Float[Array, "m s s"]:
@@ -112,13 +109,11 @@ def lower_triangles(whole: Float[Array, "m s s"]) -> Float[Array, "entries m"]:
     return whole[:, *np.tril_indices(whole.shape[-1])].T
 
 
-def _array_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array, "entries m"]:
-    s = element.indices.shape[1] * x.shape[1]
-    whole = jax.vmap(jax.hessian(element.energy))(local(element, x), data)
-    return lower_triangles(whole.reshape(-1, s, s))
-
-
-def _unrolled_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array, "entries m"]:
+def _hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array, "entries m"]:
+    if not element.unrolled:
+        s = element.indices.shape[1] * x.shape[1]
+        whole = jax.vmap(jax.hessian(element.energy))(local(element, x), data)
+        return lower_triangles(whole.reshape(-1, s, s))
     y, w = _arguments(element, x, data)
 
     def slope(y: Float[Array, "s m"]) -> Float[Array, "s m"]:

@@ -21,14 +21,13 @@ from jaxtyping import Array, Float
 from dln_jax.solvers.elements.assembly import Pattern, entries, pattern
 from dln_jax.solvers.elements.descent import Sum, descend, sum_and_gradient
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, element_hessians
-from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory
+from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory, by_size
 from dln_jax.solvers.elements.moving import (
     Lists,
     MovingEnergy,
     moving_hessians,
     with_moving,
 )
-from dln_jax.solvers.elements.selection import by_size
 from dln_jax.solvers.newton import SolverInfo
 from dln_jax.types import InputError, require_positive
 

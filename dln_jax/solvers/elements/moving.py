@@ -9,6 +9,7 @@ elements and the diagonal blocks of the moving ones, with at most about as many 
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +21,7 @@ from dln_jax.solvers.elements.assembly import Pattern
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, square
 from dln_jax.solvers.elements.linear_solvers import LinearSolver, lookup, sparse, summed_products, with_constants
 from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients
-from dln_jax.solvers.lapack import cholesky, substitute, symmetric_eigen
+from dln_jax.solvers.elimination import cholesky, substitute, symmetric_eigen
 
 _DENSE_UNKNOWNS = 1000
 """Largest systems that are solved densely: a factorisation of this size takes about as long as assembling it."""
@@ -64,14 +65,6 @@ def lists_between(moving: Sequence[MovingEnergy], x: Blocks, step: Blocks, data:
     return tuple(m.elements(x, step, of) for m, of in zip(moving, data, strict=True))
 
 
-def longest_fraction(
-    moving: Sequence[MovingEnergy], x: Blocks, step: Blocks, lists: Lists, data: Sequence[Any]
-) -> Array:
-    """Returns the largest fraction of the step that all energies allow."""
-    fractions = [m.longest(x, step, at, of) for m, at, of in zip(moving, lists, data, strict=True)]
-    return jnp.min(jnp.stack([jnp.ones((), x.dtype), *fractions]))
-
-
 def overflow(lists: Lists) -> Bool[Array, ""]:
     """Whether any list was too short."""
     return jnp.stack([jnp.asarray(False), *(elements.overflow for elements in lists)]).any()
@@ -98,11 +91,6 @@ def moving_hessians(
     )
 
 
-def project_moving(hessians: Sequence[Float[Array, "_ _ _"]]) -> tuple[Float[Array, "_ _ _"], ...]:
-    """Projects Hessians to positive semi-definite ones."""
-    return tuple(map(_projected, hessians))
-
-
 def moving_products(lists: Lists, hessians: Sequence[Array], x: Blocks) -> Blocks:
     """Returns the product of the sum of the Hessians with x."""
     out = jnp.zeros_like(x)
@@ -110,14 +98,6 @@ def moving_products(lists: Lists, hessians: Sequence[Array], x: Blocks) -> Block
         at_corners = x[elements.indices].reshape(len(blocks), -1, 1)
         out = out.at[elements.indices].add((blocks @ at_corners).reshape(*elements.indices.shape, -1))
     return out
-
-
-def add_diagonals(diagonal: Blocks, lists: Lists, hessians: Sequence[Array]) -> Blocks:
-    """Adds the absolute diagonal entries of moving elements to those of the static ones."""
-    for elements, of_elements in zip(lists, hessians, strict=True):
-        own = jnp.abs(jnp.diagonal(of_elements, axis1=1, axis2=2))
-        diagonal = diagonal.at[elements.indices].add(own.reshape(*elements.indices.shape, -1))
-    return diagonal
 
 
 def with_moving(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
@@ -129,10 +109,29 @@ def with_moving(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
         energies: the static elements.
         at: their pattern.
     """
-    return _dense(at) if at.unknowns <= _DENSE_UNKNOWNS else _iterative(sparse(energies, at), energies, at)
+    if at.unknowns > _DENSE_UNKNOWNS:
+        return _iterative(energies, at)
+    numbers = np.arange(at.unknowns)
+    table = lookup(at)(numbers[:, None], numbers[None, :])
+
+    def factorise(_: Sequence[Array], parts: tuple[Array, Lists, Sequence[Array]]) -> Array:
+        values, lists, hessians = parts
+        matrix = with_constants(values)[table]
+        for elements, blocks in zip(lists, hessians, strict=True):
+            unknowns = (elements.indices[:, :, None] * at.width + jnp.arange(at.width)).reshape(len(blocks), -1)
+            free = jnp.asarray(at.free.ravel())[unknowns]
+            kept = blocks * free[:, :, None] * free[:, None, :]
+            matrix = matrix.at[unknowns[:, :, None], unknowns[:, None, :]].add(kept)
+        return cholesky(matrix)
+
+    def solve(factor: Array, b: Blocks) -> Blocks:
+        right = jnp.where(at.free, b, 0).reshape(-1, 1)
+        return substitute(factor, substitute(factor, right), transposed=True).reshape(b.shape)
+
+    return LinearSolver(factorise, solve, solve)
 
 
-def _projected(hessians: Float[Array, "capacity s s"]) -> Float[Array, "capacity s s"]:
+def project_moving(hessians: Float[Array, "capacity s s"]) -> Float[Array, "capacity s s"]:
     """Sets negative eigenvalues to zero, one acting element after the other: there are few."""
     hessians = jnp.where(jnp.isfinite(hessians), hessians, 0)
     acting = (hessians != 0).any(axis=(1, 2))
@@ -146,32 +145,8 @@ def _projected(hessians: Float[Array, "capacity s s"]) -> Float[Array, "capacity
     return jax.lax.fori_loop(0, acting.sum(), project, hessians)
 
 
-def _unknowns(indices: Int[Array, "capacity k"], width: int) -> Int[Array, "capacity s"]:
-    return (indices[:, :, None] * width + jnp.arange(width)).reshape(len(indices), -1)
-
-
-def _dense(at: Pattern) -> LinearSolver:
-    numbers = np.arange(at.unknowns)
-    table = lookup(at)(numbers[:, None], numbers[None, :])
-
-    def factorise(_: Sequence[Array], parts: tuple[Array, Lists, Sequence[Array]]) -> Array:
-        values, lists, hessians = parts
-        matrix = with_constants(values)[table]
-        for elements, blocks in zip(lists, hessians, strict=True):
-            unknowns = _unknowns(elements.indices, at.width)
-            free = jnp.asarray(at.free.ravel())[unknowns]
-            kept = blocks * free[:, :, None] * free[:, None, :]
-            matrix = matrix.at[unknowns[:, :, None], unknowns[:, None, :]].add(kept)
-        return cholesky(matrix)
-
-    def solve(factor: Array, b: Blocks) -> Blocks:
-        right = jnp.where(at.free, b, 0).reshape(-1, 1)
-        return substitute(factor, substitute(factor, right), transposed=True).reshape(b.shape)
-
-    return LinearSolver(factorise, solve, solve)
-
-
-def _iterative(solver: LinearSolver, energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
+def _iterative(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
+    static = sparse(energies, at)
     numbers = np.arange(at.unknowns).reshape(at.blocks, at.width)
     blocks_of = lookup(at)(numbers[:, :, None], numbers[:, None, :])
     # The diagonal blocks of every vertex are entries of the static pattern.
@@ -186,10 +161,10 @@ def _iterative(solver: LinearSolver, energies: Sequence[ElementEnergy], at: Patt
             own = jnp.stack([own[:, i, :, i] for i in range(k)], axis=1)
             diagonal = diagonal.at[elements.indices].add(own)
         added = values.at[blocks_of[own_entries]].add(diagonal[own_entries])
-        return tuple(map(square, hessians)), (lists, tuple(moving)), solver.factorise(hessians, added)
+        return tuple(map(square, hessians)), (lists, tuple(moving)), static.factorise(hessians, added)
 
     def run(tolerance: float, factor: Any, right: Blocks) -> Blocks:
-        hessians, (lists, moving), static = factor
+        hessians, (lists, moving), of_static = factor
 
         def product(x: Blocks) -> Blocks:
             out = summed_products(energies, at, hessians, x) + moving_products(lists, moving, x)
@@ -197,15 +172,7 @@ def _iterative(solver: LinearSolver, energies: Sequence[ElementEnergy], at: Patt
 
         right = jnp.where(at.free, right, 0)
 
-        def precondition(r: Blocks) -> Blocks:
-            return solver.solve(static, r)
-
+        precondition = partial(static.solve, of_static)
         return conjugate_gradients(product, right, precondition, tolerance=tolerance, iterations=_UPPER_PRODUCTS)
 
-    def solve(factor: Any, b: Blocks) -> Blocks:
-        return run(_SOLVE_RESIDUAL, factor, b)
-
-    def search(factor: Any, b: Blocks) -> Blocks:
-        return run(_SEARCH_RESIDUAL, factor, b)
-
-    return LinearSolver(factorise, solve, search)
+    return LinearSolver(factorise, partial(run, _SOLVE_RESIDUAL), partial(run, _SEARCH_RESIDUAL))

@@ -23,7 +23,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra, maximum_flow
 
 from dln_jax.solvers.elements.assembly import Pattern
-from dln_jax.solvers.lapack import cholesky, substitute
+from dln_jax.solvers.elimination import cholesky, substitute
 
 # Rows of a tile: a multiple of the 2 or 3 unknowns of a vertex.
 TILE = 48

@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from dln_jax.solvers.lapack import cholesky, substitute
+from dln_jax.solvers.elimination import cholesky, substitute
 
 Vector = Float[Array, "..."]
 Factor = tuple[Float[Array, "count s s"], Float[Array, "count s s"]]
@@ -120,8 +120,8 @@ def places(unknowns: int, band: int) -> tuple[np.ndarray, np.ndarray]:
         unknowns: n.
         band: largest i - j of a nonzero entry.
     """
-    rows = PAIR * (1 + _pairs_below(band))
-    first, row, column = np.ogrid[: _pairs(unknowns), :rows, :PAIR]
+    rows = PAIR * (1 + -(-band // PAIR))
+    first, row, column = np.ogrid[: -(-unknowns // PAIR), :rows, :PAIR]
     return PAIR * first + row + 0 * column, PAIR * first + 0 * row + column
 
 
@@ -146,14 +146,19 @@ def solve_bands(lower: Columns, b: Float[Array, "unknowns k systems"]) -> Float[
 
     columns = lax.fori_loop(0, count, eliminate, columns)
 
-    def substitute(step: Array, x: Array) -> Array:
+    def two_unknowns(step: Array, x: Array) -> Array:
+        """Finds two unknowns of Lᵀ x = y from the known ones after them."""
         pair = count - 1 - step
         column = lax.dynamic_index_in_dim(columns, pair + below, keepdims=False)
         known = lax.dynamic_slice_in_dim(x, PAIR * (pair + 1), PAIR * below)
-        return lax.dynamic_update_slice_in_dim(x, _substituted(column, known, rows), PAIR * pair, 0)
+        panel = column[PAIR:rows]
+        first, second = (column[rows:, i] - jnp.sum(panel[:, None, i] * known, axis=0) for i in range(PAIR))
+        second *= column[1, 1]
+        own = jnp.stack([(first - column[1, 0] * second) * column[0, 0], second])
+        return lax.dynamic_update_slice_in_dim(x, own, PAIR * pair, 0)
 
     x = jnp.zeros((PAIR * (count + below), k, systems), lower.dtype)
-    return lax.fori_loop(0, count, substitute, x)[:unknowns]
+    return lax.fori_loop(0, count, two_unknowns, x)[:unknowns]
 
 
 def _eliminated(window: Float[Array, "pairs rows 2 systems"], rows: int) -> Float[Array, "rows 2 systems"]:
@@ -180,21 +185,3 @@ def _eliminated(window: Float[Array, "pairs rows 2 systems"], rows: int) -> Floa
     right = (panel[:, 1] - left * corner) * second
     top = jnp.stack([jnp.stack([first, jnp.zeros_like(first)]), jnp.stack([corner, second])])
     return jnp.concatenate([top, jnp.stack([left, right], axis=1)])
-
-
-def _substituted(
-    column: Float[Array, "rows 2 systems"], known: Float[Array, "rows2 k systems"], rows: int
-) -> Float[Array, "2 k systems"]:
-    """Returns two unknowns of Lᵀ x = y from the known ones after them."""
-    panel = column[PAIR:rows]
-    first, second = (column[rows:, i] - jnp.sum(panel[:, None, i] * known, axis=0) for i in range(PAIR))
-    second *= column[1, 1]
-    return jnp.stack([(first - column[1, 0] * second) * column[0, 0], second])
-
-
-def _pairs(unknowns: int) -> int:
-    return -(-unknowns // PAIR)
-
-
-def _pairs_below(band: int) -> int:
-    return (band + PAIR - 1) // PAIR
