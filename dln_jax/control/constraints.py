@@ -193,13 +193,13 @@ def worst_violation(problem: TrajectoryProblem, plan: Plan, *, tolerance: float 
             jnp.abs(jax.vmap(problem.step)(x[:-1], u, *knots) - x[1:]),
         ]
 
-    found = [np.asarray(values) for values in excesses(plan.x, plan.u)]
-    most = [np.max(values, initial=-np.inf) for values in found]
+    excess = [np.asarray(values) for values in excesses(plan.x, plan.u)]
+    most = [np.max(values, initial=-np.inf) for values in excess]
     worst = int(np.argmax(most))
     if most[worst] <= tolerance:
         return f"all constraints hold within {tolerance:g}"
     one = [*of_steps, *of_end, dynamics][worst]
-    k, i = np.unravel_index(int(np.argmax(found[worst])), found[worst].shape)
+    k, i = np.unravel_index(int(np.argmax(excess[worst])), excess[worst].shape)
     return f"{one.name.format(i=one.components[i], k=k)} is violated by {most[worst]:.3g}"
 
 

@@ -16,6 +16,8 @@ from dln_jax.figures import style
 from dln_jax.locomotion.task import FALLEN, advance, beginning, change_of, make_task, observe
 from dln_jax.softbody.mesh.shapes import crawler
 
+STEPS = 120
+
 task = make_task(crawler())
 begin = jax.jit(lambda key: beginning(task, key))
 step = jax.jit(lambda place, action: advance(task, place, change_of(place.actuation, action)))
@@ -55,7 +57,7 @@ check_env(environment, skip_render_check=True)
 
 environment.reset(seed=0)
 random, walk, held = np.random.default_rng(0), [], 10
-for number in range(120):
+for number in range(STEPS):
     if number % held == 0:
         command = random.uniform(-1, 1, task.muscle_count).astype(np.float32)
     walk.append(environment.step(command))
@@ -65,6 +67,6 @@ print(f"{len(walk)} steps, return {sum(one[1] for one in walk):.3f}")
 
 figure, axes = plt.subplots(figsize=(7, 3), layout="constrained")
 style.prepare(axes)
-for number, colour in ((0, style.BLUE), (60, style.GREEN), (119, style.VERMILLION)):
+for number, colour in ((0, style.BLUE), (STEPS // 2, style.GREEN), (STEPS - 1, style.VERMILLION)):
     axes.triplot(*x[number].T, task.creature.mesh.elements, linewidth=0.6, color=colour)
-axes.set(xlabel="x, m", ylabel="y, m", aspect="equal", title="steps 1, 61 and 120")
+axes.set(xlabel="x, m", ylabel="y, m", aspect="equal", title="the first step, half way, and the last step")

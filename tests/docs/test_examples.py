@@ -33,6 +33,7 @@ REDUCED = {
     "19_predictive_control": {"SECONDS": 2.0, "FRAMES_PER_SECOND": 2.0},
     "20_state_estimation": {"SECONDS": 1.0},
     "21_gymnasium_environment": {"SAMPLES": 50},
+    "22_gymnasium_creature": {"STEPS": 30},
 }
 """Constants of the examples, and what they are here."""
 

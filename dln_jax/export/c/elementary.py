@@ -342,8 +342,8 @@ def definitions(names: Iterable[str], precision: str, *, arrays: Iterable[str] =
     own = library = ""
     for name in (name for name in _OWN if name in needed):
         of_library = _BOTH_OF_LIBRARY if name == "sin_cos" else _OF_LIBRARY
-        each = _BOUNDED_EACH if name in ("sin", "cos") else _EACH
-        own += fill(_OWN[name] + each * (name in arrays), precision, name=name)
+        loop = _BOUNDED_EACH if name in ("sin", "cos") else _EACH
+        own += fill(_OWN[name] + loop * (name in arrays), precision, name=name)
         library += fill(of_library + _EACH * (name in arrays), precision, name=name)
     if own:  # compilers warn about functions that nothing calls
         own = f"\n#ifdef DLN_OWN_ELEMENTARY{helpers * (not bits)}{_EVALUATED}{own}\n#else\n{library}#endif\n"

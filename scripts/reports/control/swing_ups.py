@@ -79,15 +79,15 @@ def by_model(*, plant: str, model: str, seeds: int = 3, starts: int = 100) -> Nu
     for seed in range(seeds):
         fit = fit_of(model, file_of(plant), desk(plant).layout, seed)
         try:
-            found = learn_to_swing_up(desk(plant, seed=seed), fit=fit, seed=seed)
+            learned = learn_to_swing_up(desk(plant, seed=seed), fit=fit, seed=seed)
         except InputError as refusal:  # all starts fail
             print(refusal, flush=True)
             tries.append(np.full(starts, np.inf))
             continue
-        spent.append(found.seconds)
-        tries.append(try_plant(functools.partial(desk, plant), found.law, starts=starts)[0].seconds)
+        spent.append(learned.seconds)
+        tries.append(try_plant(functools.partial(desk, plant), learned.law, starts=starts)[0].seconds)
         blind = Exploration(seconds=12.0, blind=(0.4, 0.8), surplus=())
-        errors.append(errors_at(truth, found.fitted, recorded(plant, seed=500 + seed, settings=blind)))
+        errors.append(errors_at(truth, learned.fitted, recorded(plant, seed=500 + seed, settings=blind)))
     up = [seconds[np.isfinite(seconds)] for seconds in tries]
     numbers = {
         "success_share": min(np.isfinite(seconds).mean() for seconds in tries),
@@ -129,10 +129,10 @@ def anywhere(*, plant: str, starts: int = 1000) -> Numbers:
     @jax.jit
     @jax.vmap
     def run(x, key):
-        found = simulate(
+        motion = simulate(
             field, law, x, seconds=SECONDS, rate=rate, controls=1, hardware=noise, key=key, substeps=2
         )  # fmt: skip
-        return found.x[:, :2]
+        return motion.x[:, :2]
 
     q = np.asarray(run(x, jax.random.split(jax.random.key(0), starts)))
     result = outcomes(q[..., 1], rate=rate)
