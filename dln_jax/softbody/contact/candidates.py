@@ -24,7 +24,7 @@ from dln_jax.softbody.mesh.surfaces import facet_nodes
 
 CLUSTER = 8
 """Number of primitives that share one bounding box."""
-Boxes = tuple[Float[Array, "*m dim"], Float[Array, "*m dim"]]
+Boxes = tuple[Float[Array, "... dim"], Float[Array, "... dim"]]
 """Lowest and highest corners of bounding boxes, in m."""
 _PARTS = {3: ((0, 2), (2, 1)), 6: ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))}
 """Parts of a quadratic facet by its number of nodes, with the facet's orientation."""
