@@ -157,7 +157,7 @@ def log_of(
         assume: trajectories -> needs that nobody states (default: revolute joints with gravity and friction).
         driven: whether the motions need torques; without, they must have none, and rates are the command's concern.
         cutoff: low-pass q at this frequency, Hz, and derive the rates; "auto" chooses it from the data, inf leaves q as
-            it is (default: the rates of the data; "auto" if it has none and the noise of q matters).
+            it is (default: the rates of the data; "auto" if one is missing and the noise of q matters).
         decimate: with a cut-off, keep every n-th sample.
         check: whether the data are a user's, which may have faults.
         settled: names of checks that do not matter here.
@@ -199,7 +199,7 @@ def log_of(
         )
     data = data._replace(needs=needs)
     findings = quick(data, robot) if check else []
-    noisy = [finding.observation for finding in findings if finding.check == NOISY and "qd" in data.estimated]
+    noisy = [finding.observation for finding in findings if finding.check == NOISY]
     smoothed = None
     if cutoff is not None or (noisy and driven):
         try:
