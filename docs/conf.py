@@ -89,6 +89,7 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "show_signature": False,
     "min_reported_time": 1e9,
+    "write_computation_times": False,  # pages that load scripts from the network
     "first_notebook_cell": "# pip install dln-jax",
 }
 suppress_warnings = ["config.cache"]

@@ -116,7 +116,7 @@ def held_out(
     Args:
         predicted: torques of the model.
         measured: torques of motions that the model has not seen.
-        noise: standard deviations of the torques' noise, as from `data.encoders.noise_of`; not finite if unknown.
+        noise: standard deviations of the torques' noise, as from `noise_of`; not finite if unknown.
         file: torques of the robot's own file.
         recording: torques of the recording of which the held-out samples are blocks of time; their own variance may be
             small by chance.
