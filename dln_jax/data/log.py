@@ -39,7 +39,7 @@ FILTERED = (
 )  # fmt: skip
 """Checks for faults that filtering q replaces or repairs."""
 SPLIT = ("split", "repeated-motions")
-"""Checks for faults that `data.splits.split_log` settles."""
+"""Checks for faults that `split_log` settles."""
 ASSUMED = "assumed: neither the file nor --needs says"
 """Origin of needs that nobody states."""
 USES = ("training", "validation", "the test")

@@ -102,7 +102,7 @@ def load(
         path: .csv for CSV (see `data.csv_tables`); .db3, .mcap, .bag or a folder for a bag (see `data.bags`).
         rate: sampling rate of all trajectories, Hz, for a file without t.
         units: units of CSV titles without one, "si" or "degrees".
-        joints: names of joints to keep, in this order, or LOG=NEW to rename one (see `data.joint_names.select_names`).
+        joints: names of joints to keep, in this order, or LOG=NEW to rename one (see `data.joints.select_names`).
         topics: topics of joint states in a bag; by default the only one.
         torque_factor: factor of tau, N m per A for currents: one number, one for each joint, or numbers by name.
         robot: names of the robot's joints; of a bag only those are read (`splits.with_joints` orders them).

@@ -77,7 +77,7 @@ def identify(
     Bodies without mass (links between the joints of one MJCF body) stay massless.
 
     Args:
-        model: such as `models.make_rigid_tree`.
+        model: such as `make_rigid_tree`.
         known: prior parameters, such as those of a robot file; directions that the data do not determine keep them.
         data: training data with tau; hold out other motions to judge the result.
         joints: kinds of the joints, for drawing the random states; all revolute by default.

@@ -166,7 +166,7 @@ def fit_motions(
     """Fits physically consistent parameters to motions, and to torques too if their equations are given.
 
     Args:
-        model: a model that is linear in its parameters, such as `models.make_rigid_tree`.
+        model: a model that is linear in its parameters, such as `make_rigid_tree`.
         prior: values that undetermined directions keep.
         start: initial parameters with a positive definite mass matrix, such as consistent ones of a fit of torques.
         windows, slope: from `cut_motions`.

@@ -61,7 +61,7 @@ def fit_residual(
     parameters and no keywords, if no network was selected.
 
     Args:
-        rigid: such as `models.make_rigid_tree`.
+        rigid: such as `make_rigid_tree`.
         parameters: identified parameters, which stay fixed.
         train: data that the tree was identified from.
         validation: other motions, used for selection; judge the result on yet others.

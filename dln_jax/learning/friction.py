@@ -65,7 +65,7 @@ class Terms(NamedTuple):
     cooling: bool = False
     """Whether viscous friction depends on the log's temperature; its mean becomes the reference."""
     motors: Rows | None = None
-    """Like `coupled`, as for `models.make_rigid_tree`."""
+    """Like `coupled`, as for `make_rigid_tree`."""
     coupled: tuple[Pair, ...] = ()
 
     @property

@@ -80,8 +80,8 @@ def fit_momentum(
     with its rank and condition.
 
     Args:
-        model: linear in its parameters, such as `models.make_rigid_tree` and `models.make_trigonometric`.
-        data: at equal time steps, with smooth velocities and measured torques, such as from `data.encoders.smooth`.
+        model: linear in its parameters, such as `make_rigid_tree` and `make_trigonometric`.
+        data: at equal time steps, with smooth velocities and measured torques, such as from `smooth`.
         window: length in s, at least `FEWEST` steps.
         noise: deviations of the torques' noise that divide the equations (default: those of the torques themselves).
         reweighted: weight the equations by the covariance of their own errors until it settles (iterated generalised

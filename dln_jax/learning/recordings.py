@@ -113,7 +113,7 @@ def delay_of_torques(model: Model, recording: Trajectories) -> float:
     is rounded to it.
 
     Args:
-        model: model that is linear in its parameters, such as `models.make_trigonometric`.
+        model: model that is linear in its parameters, such as `make_trigonometric`.
         recording: q and the commanded torques.
 
     Raises:

@@ -2,7 +2,7 @@
 
 The mean squared error e of a joint is compared with four numbers from the same samples: the variance v of its torque
 (the error of predicting the mean), its mean square z (the error of predicting zero), the variance n of its noise, and
-the error of the robot's own file. A joint is::
+the error of the robot's own file. A joint is:
 
     explained     e <= UNEXPLAINED v + NOISE n
     unexplained   e >= v: a constant would have done as well
@@ -19,7 +19,7 @@ A predicted motion escapes if a state is not finite, or if a momentum or a posit
 times the farthest measured one; angles may grow, since a pendulum can turn over. The error of a motion is the mean
 square over one period of the system, after the samples that its start was fitted to, and over measured columns alone;
 chaotic motions later diverge from any model. Its unit is the smallest error of a guess without a model: rest, no force,
-the mean of the test motions, or the variance of the data::
+the mean of the test motions, or the variance of the data:
 
     refused    a motion escapes, or the median error exceeds FAILED (an rms error of half the unit)
     doubtful   it exceeds UNEXPLAINED; MOTION_NOISE times the variance of the noise is added to both limits, but a
@@ -116,7 +116,7 @@ def held_out(
     Args:
         predicted: torques of the model.
         measured: torques of motions that the model has not seen.
-        noise: standard deviations of the torques' noise, as from `data.encoders.noise_of`; not finite if unknown.
+        noise: standard deviations of the torques' noise, as from `noise_of`; not finite if unknown.
         file: torques of the robot's own file.
         recording: torques of the recording of which the held-out samples are blocks of time; their own variance may be
             small by chance.

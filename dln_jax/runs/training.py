@@ -42,8 +42,8 @@ def train(
 
     Args:
         log: from `read_log`; or trajectories, or a file.
-        model: "auto" for model selection, or one of `learning.settings.WAYS`.
-        test: test trajectories, as for `data.parts.split_log`.
+        model: "auto" for model selection, or one of `learning.fits.settings.WAYS`.
+        test: test trajectories, as for `data.log.split_log`.
         seed: seed of parameters, shuffling and the validation split.
         seconds: time limit of the fit.
         uncertainty: estimate the uncertainty of the torques.
@@ -90,7 +90,7 @@ def identify(
     Args:
         robot: the robot, or its URDF or MJCF file.
         log: from `read_log`; or trajectories, or a file, whose joints are matched by name.
-        test: test trajectories, as for `data.parts.split_log`.
+        test: test trajectories, as for `data.log.split_log`.
         say: takes lines on the progress.
 
     Raises:

@@ -92,7 +92,7 @@ def residual_network(make: Callable[[Needs], Model], needs: Needs, **keywords: A
 
 
 def make_stored_tree(needs: Needs, *, tree: dict[str, Any], **keywords: Any) -> Model:
-    """`make_rigid_tree` for a tree from `mechanics.trees.tree_to_json`, with the friction named by the needs."""
+    """`make_rigid_tree` for a tree from `tree_to_json`, with the friction named by the needs."""
     frames = tree_from_json(tree)
     if (frames.joints, frames.needs.gravity) != (needs.joints, needs.gravity):
         raise InputError(
