@@ -25,8 +25,14 @@ _SETTING = "jax_cpu_enable_async_dispatch"
 def enable_low_latency() -> None:
     """Makes JAX compute on the CPU in the calling thread, for the whole process from now on.
 
+    A call of a small function then takes a few microseconds less. Call it before the first array.
+
     Raises:
         InputError: a backend has already started (any array or list of devices starts it), or JAX is not on the CPU.
+
+    Example:
+        >>> import dln_jax
+        >>> dln_jax.enable_low_latency()  # right behind the imports
     """
     platforms = getattr(jax.config, "jax_platforms")  # noqa: B009  JAX adds its settings as it starts
     if (first := (platforms or "cpu").split(",")[0]) != "cpu":
@@ -51,6 +57,14 @@ def low_latency(function: Callable[..., Any], *examples: Any) -> Callable[..., A
 
     Raises:
         InputError: there are no examples, or the default device is not a CPU.
+
+    Example:
+        >>> import numpy as np
+        >>> import dln_jax
+        >>> cart = dln_jax.dynamics(dln_jax.LagrangianSystem(lambda q, qd: 1.5 * qd @ qd))
+        >>> torque = dln_jax.low_latency(cart.inverse_dynamics, *np.ones((3, 1)))
+        >>> print(torque(np.zeros(1), np.zeros(1), np.array([2.0])))
+        [6.]
     """
     if (platform := jax.default_backend()) != "cpu":
         raise InputError(_only_on_cpu(platform))

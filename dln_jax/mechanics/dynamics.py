@@ -59,7 +59,17 @@ class Flow(NamedTuple):
 
 
 class InverseForward(NamedTuple):
-    """A system without energy: two functions of one state that need not be inverses of each other."""
+    """A system without energy: two functions of one state that need not be inverses of each other.
+
+    It is the record of networks without physics. `dynamics` checks the arguments and returns the same record; there is
+    no energy, no mass matrix and no flow. All vectors are [d], in SI units.
+
+    Example:
+        >>> import dln_jax
+        >>> system = dln_jax.InverseForward(lambda q, qd, qdd: 2 * qdd + 3 * qd, lambda q, qd, tau: (tau - 3 * qd) / 2)
+        >>> print(dln_jax.dynamics(system).inverse_dynamics([0.5], [1.0], [2.0]))
+        [7.]
+    """
 
     inverse_dynamics: Callable[..., Array]
     """(q, qd, qdd) -> tau [d]."""
@@ -72,7 +82,18 @@ class InverseForward(NamedTuple):
 
 
 class PhaseRates(NamedTuple):
-    """Rates of a state in a phase space."""
+    """Rates of a state in a phase space.
+
+    It is the record of vector fields that need not come from an energy. `flow` checks the arguments and returns the
+    rates, with the energy if there is one. It defines no forces, so `dynamics` raises `InputError`.
+
+    Example:
+        >>> import dln_jax
+        >>> damped = dln_jax.PhaseRates(lambda q, p: (p, -4 * q - 0.1 * p))
+        >>> qd, pd = dln_jax.flow(damped).rates([1.0], [2.0])
+        >>> print(qd, pd.round(2))
+        [2.] [-4.2]
+    """
 
     rates: Callable[..., tuple[Array, Array]]
     """(q, p) -> (qd, pd), both [d]."""

@@ -232,8 +232,9 @@ def joint_dissipation(
 ) -> Dissipation | None:
     """Returns (q, qd) -> D in W, or `None` if all coefficients are absent or known to be zero.
 
-    D is the sum of the laws' integrals over all joints. It is smooth at rest, and non-negative for non-negative
-    coefficients (except the part of the offset, which is not a loss). The force is exactly that of the table.
+    D is the Rayleigh function of all joints: the friction force dD/dqd is exactly the sum of the laws in the table of
+    `mechanics.friction`. D is smooth at rest. It is non-negative for non-negative coefficients, except for the offset,
+    which is not a loss.
 
     Args:
         viscous, coulomb, offset, stribeck: as in `FrictionCoefficients`; one per joint [d] or one for all.
@@ -243,6 +244,13 @@ def joint_dissipation(
 
     Raises:
         InputError: a known coefficient is negative or not finite, or a known velocity or slope is not positive.
+
+    Example:
+        >>> import dln_jax
+        >>> D = dln_jax.joint_dissipation(viscous=[0.5, 0.1], coulomb=2.0)  # N m s, N m
+        >>> arm = dln_jax.dynamics(dln_jax.LagrangianSystem(lambda q, qd: 0.5 * qd @ qd, D))
+        >>> print(arm.friction([0.0, 0.0], [1.0, -1.0]).round(2))
+        [ 2.5 -2.1]
     """
     coefficients = FrictionCoefficients(
         viscous, coulomb, offset, stribeck,

@@ -33,7 +33,20 @@ MOST_STEPS = 30
 
 
 class HamiltonianSystem(NamedTuple):
-    """Energies of any Hamiltonian system, as functions of one state, and settings of the momentum solve."""
+    """Energies of any Hamiltonian system, as functions of one state, and settings of the momentum solve.
+
+    `flow` returns Hamilton's equations dq/dt = dH/dp, dp/dt = -dD/dqd - dH/dq. `dynamics` returns the equations in
+    coordinates and velocities; a Newton iteration then solves dH/dp = qd for the momentum. All vectors are [d], in SI
+    units.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import dln_jax
+        >>> pendulum = dln_jax.HamiltonianSystem(lambda q, p: 0.5 * p[0] ** 2 - 9.81 * jnp.cos(q[0]))
+        >>> qd, pd = dln_jax.flow(pendulum).rates([0.5], [1.0])
+        >>> print(qd, pd.round(2))
+        [1.] [-4.7]
+    """
 
     hamiltonian: Hamiltonian
     """(q, p) -> H, scalar."""

@@ -19,7 +19,19 @@ from dln_jax.types import Dissipation, Lagrangian, Matrix, Scalar, Vector
 
 
 class LagrangianSystem(NamedTuple):
-    """Energies of any Lagrangian system, as functions of one state."""
+    """Energies of any Lagrangian system, as functions of one state.
+
+    `dynamics` returns the equations d/dt dL/dqd - dL/dq + dD/dqd = tau (Euler-Lagrange, with a Rayleigh function D). A
+    singular mass matrix d²L/dqd² gives non-finite accelerations. All vectors are [d], in SI units.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import dln_jax
+        >>> pendulum = dln_jax.LagrangianSystem(lambda q, qd: 0.5 * qd[0] ** 2 + 9.81 * jnp.cos(q[0]))
+        >>> acceleration = dln_jax.dynamics(pendulum).forward_dynamics([0.5], [0.0], [1.0])  # tau - 9.81 sin q
+        >>> print(f"{acceleration[0]:.3f} 1/s²")
+        -3.703 1/s²
+    """
 
     lagrangian: Lagrangian
     """(q, qd) -> L, scalar."""

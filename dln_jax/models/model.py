@@ -51,7 +51,17 @@ class Model(NamedTuple):
     """Energies with parameters, as a pair of pure functions.
 
     `energies` closes over the parameters, so a trained model and a textbook system have the same type and run through
-    the same mechanics: `mechanics.equations.dynamics(model.energies(parameters))`.
+    the same mechanics: `dynamics(model.energies(parameters))`. Write your own with any network library; a Haiku
+    transform fits as it is.
+
+    Example:
+        >>> import jax
+        >>> import dln_jax
+        >>> def energies(m):
+        ...     return dln_jax.LagrangianSystem(lambda q, qd: 0.5 * m["mass"] * qd @ qd)
+        >>> cart = dln_jax.Model(lambda key: {"mass": jax.random.uniform(key, (), minval=1.0, maxval=2.0)}, energies)
+        >>> print(dln_jax.dynamics(cart.energies({"mass": 3.0})).inverse_dynamics([0.0], [0.0], [2.0]))
+        [6.]
     """
 
     init: Callable[[Array], Parameters]
@@ -78,13 +88,32 @@ def make_delan(
     shared_trunk: bool = False,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """Returns the (init, energies) pair of a structured DeLaN.
+    """Returns a deep Lagrangian network with structure (Lutter, Ritter and Peters 2019).
+
+    L(q, qd) = ½ qdᵀ M(q) qd - V(q), with M = L Lᵀ. One network has the entries of the Cholesky factor L as outputs,
+    another the potential V. Revolute joints enter as cos and sin.
 
     Args:
+        needs: joints and terms of the system. The model has no potential without gravity, and no dissipation without
+            friction.
+        width: units of each hidden layer.
+        depth: number of hidden layers.
+        activation: name or function; it must be smooth, because forces are derivatives of the networks.
         diagonal_shift: added to the pre-activation of L's diagonal; sets the initial diagonal.
         diagonal_floor: smallest diagonal element of L, in the square root of the unit of M; keeps M regular.
-        shared_trunk: whether factor and potential are outputs of one network instead of two.
-        needs, width, depth, activation, dtype: as described in `models.model`.
+        shared_trunk: use one network for factor and potential instead of two.
+        dtype: type of the parameters.
+
+    Raises:
+        InputError: width or depth is not positive, or the activation is unknown.
+
+    Example:
+        >>> import jax
+        >>> import dln_jax
+        >>> model = dln_jax.make_delan(dln_jax.Needs(joints=("revolute", "revolute")), width=16)
+        >>> arm = dln_jax.dynamics(model.energies(model.init(jax.random.key(0))))
+        >>> print(arm.inverse_dynamics([0.3, 1.2], [0.5, -1.0], [2.0, 0.1]).shape)
+        (2,)
     """
     networks = perceptrons(width, depth, activation)
     terms = partial(

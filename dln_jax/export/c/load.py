@@ -53,6 +53,13 @@ def load_c(
 
     Raises:
         InputError: files are missing, altered or of another format, there is no compiler, or it fails.
+
+    Example:
+        >>> import numpy as np
+        >>> import dln_jax
+        >>> paths = dln_jax.export_c({"square": (lambda x: x**2, (np.ones(3),))}, "square-c")
+        >>> dln_jax.load_c("square-c").square([1.0, 2.0, 3.0])
+        array([1., 4., 9.])
     """
     precision, signatures, sources = read_interface(Path(directory), check_name(name))
     types = {**NUMPY_TYPES, "bool": np.int32, "real": PRECISIONS[precision][0]}

@@ -54,7 +54,10 @@ def export_c(
     loop_bound: int | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Writes NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt, and returns their paths.
+    """Exports functions of one state as C99: NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt.
+
+    The C code allocates no memory and needs only <math.h>. It gives the numbers of JAX, up to rounding. The header states
+    shapes and units. `load_c` calls the code from Python.
 
     Args:
         functions: name -> (function, examples): a function with its parameters closed over, and one example per
@@ -73,9 +76,20 @@ def export_c(
             constant. A loop that needs more ends with NaN (integers: the largest; booleans: true).
         overwrite: replace existing files.
 
+    Returns:
+        The paths of the files.
+
     Raises:
         InputError: a function cannot be written in C or needs more stack, a name is invalid in C, the source exceeds 10
             MB, files exist, or the folder belongs to a run, whose files are never replaced.
+
+    Example:
+        >>> import numpy as np
+        >>> import dln_jax
+        >>> cart = dln_jax.dynamics(dln_jax.LagrangianSystem(lambda q, qd: 1.5 * qd @ qd))
+        >>> paths = dln_jax.export_c({"torque": (cart.inverse_dynamics, tuple(np.ones((3, 1))))}, "cart-c")
+        >>> print(*[path.name for path in paths])
+        model.h model.c model_demo.c CMakeLists.txt model.json
     """
     require_positive(stack=stack, loop_bound=1 if loop_bound is None else loop_bound)
     check_name(name)
