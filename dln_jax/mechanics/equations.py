@@ -51,8 +51,8 @@ def dynamics(system: InverseForward, *, degrees_of_freedom: int | None = None) -
 def dynamics(system: System, *, degrees_of_freedom: int | None = None) -> Dynamics | InverseForward:
     """Returns the functions of a system in coordinates and velocities.
 
-    They solve tau = M(q) qdd + c(q, qd) + g(q) + dD/dqd for tau or for qdd, and return energy, mass matrix, parts of the
-    torque and friction force. Each takes one state with vectors [d] in SI units; use `jax.vmap` for samples.
+    They solve tau = M(q) qdd + c(q, qd) + g(q) + dD/dqd for tau or for qdd, and return energy, mass matrix, torque
+    components and friction. Each takes one state with vectors [d] in SI units; use `jax.vmap` for samples.
 
     Args:
         system: a record of energies, or `InverseForward`.
@@ -174,7 +174,7 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pha
 
 
 def driving_force(system: Energies, q: Vector, qd: Vector, tau: Vector) -> Vector:
-    """Returns the generalised force [d] that is left to move the system after friction."""
+    """Returns the generalised force [d] minus friction: the part that moves the system."""
     if isinstance(system, LoadedSystem):
         return link_force(system, q, qd, tau)
     force = friction_of(system)
@@ -182,7 +182,7 @@ def driving_force(system: Energies, q: Vector, qd: Vector, tau: Vector) -> Vecto
 
 
 def hamiltonian_of(system: Energies) -> Hamiltonian:
-    """Returns H(q, p) of any energies; of a Lagrangian by the Legendre transform, in general by Newton's method."""
+    """Returns H(q, p) of any energies; of a Lagrangian by the Legendre transform (Newton's method)."""
     match system:
         case HamiltonianSystem():
             return system.hamiltonian

@@ -2,8 +2,8 @@
 
     d/dt dL/dqd - dL/dq = tau        (Euler-Lagrange)
 
-Only the necessary derivatives are taken: the inverse model is one `jvp` of the gradient; the forward model adds the
-Hessian by qd, in a linear solve. Nothing is regularised: a singular mass matrix gives non-finite accelerations.
+The inverse model is one `jvp` of the gradient. The forward model also solves a linear system with the Hessian by qd.
+Nothing is regularised: a singular mass matrix gives non-finite accelerations.
 """
 
 from functools import partial
@@ -71,7 +71,7 @@ def forward_dynamics(L: Lagrangian, q: Vector, qd: Vector, tau: Vector) -> Vecto
 def functions(system: LagrangianSystem, degrees_of_freedom: int | None) -> Functions:
     """Returns the functions of the system.
 
-    Without `degrees_of_freedom`, they refuse states that lack entries which L reads, or have rates that L ignores.
+    Without `degrees_of_freedom`, they refuse states that are too short for L, and states with rates that L ignores.
     """
     accepted = {degrees_of_freedom}
 

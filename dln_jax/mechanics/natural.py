@@ -69,7 +69,7 @@ def lagrangian(system: NaturalSystem) -> Lagrangian:
 
 
 def hamiltonian(system: NaturalSystem | NaturalHamiltonian) -> Hamiltonian:
-    """Returns H(q, p) = T + V: ½ |L⁻¹ p|² + V(q) with the factor of M, ½ |Lᵀ p|² + V(q) with that of M⁻¹."""
+    """Returns H(q, p) = T + V: ½ |L⁻¹ p|² + V(q) with the factor of M, ½ |Lᵀ p|² + V(q) with the factor of M⁻¹."""
     if isinstance(system, NaturalHamiltonian):
         return lambda q, p: plus_potential(_half_square(system.inverse_factor(q).T @ p), system.potential, q)
     return lambda q, p: plus_potential(_half_square(solve_lower(system.cholesky(q), p)), system.potential, q)

@@ -56,8 +56,8 @@ def export_c(
 ) -> list[Path]:
     """Exports functions of one state as C99: NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt.
 
-    The C code allocates no memory and needs only <math.h>. It gives the numbers of JAX, up to rounding. The header states
-    shapes and units. `load_c` calls the code from Python.
+    The C code allocates no memory and needs only <math.h>. It gives the numbers of JAX, up to rounding. The header
+    states shapes and units. `load_c` calls the code from Python.
 
     Args:
         functions: name -> (function, examples): a function with its parameters closed over, and one example per
