@@ -143,9 +143,9 @@ def fit_values(
             history, spent = list(history), history[-1].seconds if history else 0.0
             lowest = min((at.validation for at in history if math.isfinite(at.validation)), default=math.inf)
             for number in range(len(history), numbers.iterations):
-                grown = number / max(numbers.iterations - 1, 1) memory = jnp.asarray(numbers.first_memory ** (1 - grown)
-                * numbers.memory**grown) with held_back():  # an interrupt inside XLA is lost, or ends the process by
-                SIGABRT
+                grown = number / max(numbers.iterations - 1, 1)
+                memory = jnp.asarray(numbers.first_memory ** (1 - grown) * numbers.memory**grown)
+                with held_back():  # an interrupt inside XLA is lost, or ends the process by SIGABRT
                     current, state, loss = advance(current, state, jax.random.fold_in(key, 2 + number), memory)
                     score = float(judge(current, validated))
                     if score < lowest:

@@ -182,7 +182,7 @@ def _stated(name: str, usual: np.ndarray, wish: Any) -> tuple[float, ...]:
     numbers = np.asarray(wish, float)
     if numbers.shape != usual.shape or not (np.isfinite(numbers) & (numbers > 0)).all():
         raise InputError(
-            f"{name} are {numbers.tolist()}; expected {len(usual)} positive numbers, first for coordinates, then for rates"
+            f"{name} are {numbers.tolist()}; expected {len(usual)} positive numbers, coordinates first, then rates"
         )
     return tuple(numbers.tolist())
 

@@ -124,7 +124,8 @@ def checked(problem: ControlProblem, *, tolerance: float = 1e-6) -> ControlProbl
     if not problem.discount >= 0:
         raise InputError(f"discount is {problem.discount}; expected a rate in 1/s, 0 or more")
 
-    @jax.jit  # one program compiles faster than many small ones def at_rest(x: Array) -> tuple[Array, Array]:
+    @jax.jit  # one program compiles faster than many small ones
+    def at_rest(x: Array) -> tuple[Array, Array]:
         u = optimal_control(problem, x, jnp.zeros_like(x))
         return jnp.max(jnp.abs(rates(problem)(x, u))), problem.state_cost(x) + problem.action_cost.cost(u)
 

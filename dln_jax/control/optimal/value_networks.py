@@ -253,6 +253,6 @@ def fit_hjb(
             break
     if not np.isfinite(lowest):
         raise InputError(
-            "the equation is not finite at the samples; find the states in the box where the plant or a cost is infinite"
+            "the equation is not finite at the samples; find states where the plant or a cost is not finite"
         )
     return ValueFit(local(best, mesh), float(lowest), history, history[-1].seconds)
