@@ -1,12 +1,12 @@
 """Low-latency calls on the CPU, for control loops.
 
-By default JAX hands a computation on the CPU to another thread and returns at once, so a loop that waits for the result
-pays for two thread switches. `enable_low_latency` makes JAX compute in the calling thread. JAX reads the setting when
-its backend starts and silently ignores it afterwards, so a late call is refused. Single calls become faster; large
-batches, whose preparation overlaps with the computation, may become slower.
+By default JAX passes a CPU computation to another thread and returns at once, so a loop that waits for the result pays
+for two thread switches. `enable_low_latency` makes JAX compute in the calling thread. JAX reads the setting when its
+backend starts and silently ignores it afterwards, so a late call is refused. Single calls become faster. Large batches
+may become slower, because preparation no longer overlaps with computation.
 
-A jitted function with its parameters closed over is 1 to 2 us faster than the result of `lower().compile()`, whose call
-passes through more Python; `low_latency` therefore returns a jitted function.
+A call of a jitted function with its parameters closed over is 1 to 2 us faster than a call of `lower().compile()`,
+which runs more Python. So `low_latency` returns a jitted function.
 """
 
 from collections.abc import Callable
@@ -39,8 +39,8 @@ def enable_low_latency() -> None:
         raise InputError(_only_on_cpu(first))
     if jax.config.read(_SETTING) and backend_started():
         raise InputError(
-            "enable_low_latency() was called after JAX had started its backend, which reads the setting when it "
-            "starts; call it before the first array, right behind the imports"
+            "JAX has already started its backend and reads this setting only at the start; call enable_low_latency() "
+            "before the first array, right behind the imports"
         )
     jax.config.update(_SETTING, False)
 
@@ -69,7 +69,7 @@ def low_latency(function: Callable[..., Any], *examples: Any) -> Callable[..., A
     if (platform := jax.default_backend()) != "cpu":
         raise InputError(_only_on_cpu(platform))
     if not examples:
-        raise InputError("low_latency got no example; give one argument of each kind that calls will have")
+        raise InputError("low_latency got no example; pass one example for each argument")
     compiled = jax.jit(function)
     # JAX caches a fast dispatch path for NumPy and for device arrays, each at the first call with such arrays.
     for convert in (np.asarray, jnp.asarray):
@@ -79,6 +79,6 @@ def low_latency(function: Callable[..., Any], *examples: Any) -> Callable[..., A
 
 def _only_on_cpu(platform: str) -> str:
     return (
-        f"low-latency mode is for the CPU, and JAX computes on {platform}: there every call waits for a launch and for "
-        "copies both ways, whatever it computes; set JAX_PLATFORMS=cpu before JAX is imported, or export C (export_c)"
+        f"low-latency mode is for the CPU, but JAX computes on {platform}, where every call waits for a launch and for "
+        "copies both ways; set JAX_PLATFORMS=cpu before importing JAX, or export C (export_c)"
     )

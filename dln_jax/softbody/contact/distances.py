@@ -29,10 +29,10 @@ from jaxtyping import Array, Float, Int
 POINT_TRIANGLE, EDGE_EDGE = 0, 1
 """Kinds of pairs in space: (p, a, b, c), and (a, b, c, d) with edges from a to b and from c to d. The plane has one
 kind: a point and an edge, (p, a, b)."""
-# Two directions whose squared sine is below this count as parallel; their closest points are sought on the boundary.
+# Directions with a smaller squared sine count as parallel; the search for their closest points is on the boundary.
 _PARALLEL = 1e-20
 REMAINING = 0.1
-"""Fraction of its distance that a pair keeps in one step."""
+"""Smallest fraction of a pair's distance that remains after one step."""
 _ADVANCE = 0.9
 _ITERATIONS = 200
 
