@@ -41,8 +41,8 @@ def test_states_that_fit_are_taken():
 
 def test_an_energy_that_is_wrong_in_itself_is_not_blamed_on_the_state():
     for energy, message in [
-        (lambda q, qd: 0.5 * qd @ qd - jnp.cos(q[:1]), r"no scalar \(Gradient only .* had shape: \(1,\)\)"),
-        (lambda q, qd: None, "an energy of the system is no scalar"),
+        (lambda q, qd: 0.5 * qd @ qd - jnp.cos(q[:1]), r"not a scalar \(Gradient only .* had shape: \(1,\)\)"),
+        (lambda q, qd: None, "an energy of the system is not a scalar"),
         (lambda q, qd: 0.5 * np.dot(np.asarray(qd), np.asarray(qd)), "NumPy or Python numbers .*; use jax.numpy"),
         (lambda q, qd: 0.5 * qd @ qd + (q[0] if q[0] > 0 else 0.0), "NumPy or Python numbers"),
         (lambda q, qd, shape: 0.5 * qd @ qd, "missing 1 required positional argument: 'shape'"),

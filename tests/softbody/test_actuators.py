@@ -246,7 +246,7 @@ def test_mistakes_of_actuators_say_what_is_wrong():
     for mistake, words in (
         (lambda: pressure(mesh, wall[1:]), "open at 2 vertices, the first is vertex 1"),
         (lambda: pressure(quadratic(mesh), wall[1:]), r"or use linear elements \(order 1\)"),
-        (lambda: pressure(mesh, [[0, 99]]), "facet 0 is .0, 99.; expected 2 different ones of 0..15"),
+        (lambda: pressure(mesh, [[0, 99]]), "facet 0 is .0, 99.; expected 2 different vertices of 0..15"),
         (lambda: pressure(mesh, [[0, 1], [1, 0]]), "is repeated"),
         (lambda: inner_surface(cube), "no closed cavity"),
         (lambda: facets_in(named, "few"), "'few' contains no edge of the surface"),

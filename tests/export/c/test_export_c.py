@@ -187,7 +187,7 @@ def test_a_kill_leaves_an_old_export_or_a_new_one_or_a_refusal(tmp_path, monkeyp
         try:
             source = interface.read_interface(folder, "model")[2]["model.c"]
         except InputError as error:
-            assert 0 < renamed < total and "is altered, renamed or of another export" in str(error)
+            assert 0 < renamed < total and "is altered, renamed or from another export" in str(error)
         else:
             assert source == (after if renamed == total else before)["model.c"]
 

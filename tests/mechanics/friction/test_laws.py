@@ -104,7 +104,7 @@ def test_what_are_no_laws_and_no_coefficients_is_refused():
         with one_line(message):
             require_laws(laws, "laws")
     for options, message in [
-        ({"viscous": -0.1}, "viscous is -0.1; expected finite numbers, none of them negative"),
+        ({"viscous": -0.1}, "viscous is -0.1; expected finite numbers of at least 0"),
         ({"coulomb": [0.1, np.nan]}, "coulomb is"),
         ({"offset": np.inf}, "offset is inf; expected finite numbers$"),
         ({"coulomb": 0.1, "velocity_scale": 0.0}, "velocity_scale is 0.0; expected a positive number"),
