@@ -25,7 +25,7 @@ def without_numpy(q, qd):
 
 def test_states_of_another_size_are_refused():
     for energy, size, message in [
-        (pendulums, 1, "takes no states of size 1 .*out of bounds"),
+        (pendulums, 1, "does not take states of size 1 .*out of bounds"),
         (pendulums, 3, "does not depend on coordinate 2"),
         (without_numpy, 4, "does not depend on coordinate 2, 3"),
     ]:
@@ -62,5 +62,5 @@ def test_masses_may_be_traced_and_do_not_hide_a_state_that_is_too_short():
     np.testing.assert_allclose(jax.grad(torque)(3.0), slope, rtol=1e-5)
     np.testing.assert_allclose(jax.jit(torque)(3.0), 3 * slope, rtol=1e-5)
     np.testing.assert_allclose(jax.vmap(torque)(jnp.full(3, 3.0)), 3 * slope, rtol=1e-5)
-    with one_line("takes no states of size 1"):
+    with one_line("does not take states of size 1"):
         jax.grad(lambda mass: torque(mass, size=1))(2.0)

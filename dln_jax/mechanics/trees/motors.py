@@ -33,7 +33,7 @@ def require_motors(rates: Any, coupled: Sequence[Pair], d: int) -> None:
             raise InputError(f"motors is {S.tolist()}; expected an invertible matrix S, motor rates = S qd")
     if len(set(coupled)) < len(coupled) or not all(0 <= i < j < d for i, j in coupled):
         stated = ", ".join(f"{i + 1}:{j + 1}" for i, j in coupled)
-        raise InputError(f"coupled is {stated}; expected different pairs of two joints, 1 to {d}, lower first")
+        raise InputError(f"coupled is {stated}; expected distinct pairs i:j of joints with 1 <= i < j <= {d}")
 
 
 def armature_matrix(inertias: Any, rates: Any = None, coupling: Mapping[Pair, Any] | None = None) -> Any:

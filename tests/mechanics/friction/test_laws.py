@@ -98,7 +98,7 @@ def test_what_are_no_laws_and_no_coefficients_is_refused():
     for laws, message in [
         (["viscous", "dahl"], "laws has 'dahl'; expected some of viscous, coulomb, stribeck,"),
         (["viscous", "viscous"], "expected each law once"),
-        (["asymmetric", "coulomb"], "asymmetric and coulomb, which no data can tell apart; leave one out"),
+        (["asymmetric", "coulomb"], "asymmetric and coulomb, and no data can tell them apart; leave coulomb out"),
         ([["viscous"]], "expected some of"),
     ]:
         with one_line(message):

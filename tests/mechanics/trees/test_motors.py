@@ -61,7 +61,7 @@ def test_invalid_motors_are_refused():
     arm = serial(*FRAMES, LINKS, armature=A)
     for make, message in (
         (lambda: require_motors(np.ones((3, 3)), (), 3), "motors is .* expected an invertible matrix"),
-        (lambda: require_motors(None, ((1, 1),), 3), "coupled is 2:2; expected different pairs of two joints"),
+        (lambda: require_motors(None, ((1, 1),), 3), "coupled is 2:2; expected distinct pairs i:j of joints"),
         (lambda: make_rigid_tree(arm), "armature couples joints 2 and 3, .* or couple them .--coupled 2:3"),
         (lambda: make_rigid_tree(arm, cooling=0.1), "cooling is 0.1, but friction has no law; add 'viscous'"),
         (lambda: serial(*FRAMES, LINKS, armature=A - np.eye(3)), "armature is not symmetric positive semidefinite"),
