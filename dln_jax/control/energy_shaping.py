@@ -129,5 +129,5 @@ def energy_shaping(
 def with_energy(model: Dynamics | InverseForward) -> Dynamics:
     """Returns the model if it has an energy; raises `InputError` otherwise."""
     if not isinstance(model, Dynamics):
-        raise InputError("the energy law needs a model with an energy; train one, such as a DeLaN")
+        raise InputError("the model has no energy, but the energy law needs one; train a DeLaN, for example")
     return model
