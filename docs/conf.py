@@ -46,6 +46,7 @@ default_role = "code"  # docstrings write `name` as Markdown does
 add_module_names = False
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
+copybutton_exclude = ".linenos, .gp, .go"  # an example is copied without its prompts and output
 python_use_unqualified_type_names = True
 
 html_theme = "furo"
