@@ -24,7 +24,7 @@ REASONS = {
     Ending.CONVERGED: "converged within the tolerance",
     Ending.OUT_OF_ITERATIONS: "ran out of iterations before it reached the tolerance; allow more, or start closer",
     Ending.NO_DESCENT: "found no improving step; scale the problem, or start closer",
-    Ending.NOT_FINITE: "met a non-finite number; start closer, or bound the states and controls",
+    Ending.NOT_FINITE: "met a number that is not finite; start closer, or bound the states and controls",
     Ending.VIOLATED: "ended where constraints are violated (`control.worst_violation` names the worst); start closer, "
     "or make them soft",
     Ending.INFEASIBLE: "is locally infeasible: no small change lowers the violation (`control.worst_violation` names "
