@@ -1,10 +1,10 @@
 """Swing-ups by energy, from a known or learned model, with gains and costs from the model's natural scales.
 
-1. The model's friction is removed; the remaining system has an energy and a smooth linearisation. 2. The model's own
-equilibrium near the goal is computed, because a learned potential is not exactly level at the goal. 3. Far from it the
-energy law acts; near it the regulator of the linearisation acts. The regulator's cost to go decides. 4. A share of the
-friction of the active joints is compensated, at the measured rates. 5. At rest the energy law returns zero, and dry
-friction would hold the plant. A kick starts it.
+1. The model's friction is removed; the remaining system has an energy and a smooth linearisation.
+2. The model's own equilibrium near the goal is computed, because a learned potential is not exactly level at the goal.
+3. Far from it the energy law acts; near it the regulator of the linearisation acts. The regulator's cost to go decides.
+4. A share of the friction of the active joints is compensated, at the measured rates.
+5. At rest the energy law returns zero, and dry friction would hold the plant. A kick starts it.
 
 With the active joints locked at the goal, the passive part falls from the goal at a rate lambda. It needs the energy E
 from its lowest to its highest posture, and swings at the speed w = √(2 E / M_pp) at most. Motors at their limits

@@ -1,11 +1,11 @@
 """Motions for learning any plant without a model: first smooth noise, then energy laws of a learned model.
 
 1. Blind episodes: smooth noise, with a spring and a damper scaled by the limits of motors and coordinates. If `guarded`
-stops an episode, later episodes have half the noise, and the rest of its time is repeated once. 2. A model is fitted.
-The other episodes follow its energy law, with noise, to energies below and above the goal; the model is refitted on the
-way. 3. If no episode came near the goal, the model does not know the weight there. This happens with an acrobot,
-because its motor hardly moves the passive joint. The remaining episodes follow a plan of the model to the goal, with
-less noise.
+   stops an episode, later episodes have half the noise, and the rest of its time is repeated once.
+2. A model is fitted. The other episodes follow its energy law, with noise, to energies below and above the goal; the
+   model is refitted on the way.
+3. If no episode came near the goal, the model does not know the weight there. This happens with an acrobot, because its
+   motor hardly moves the passive joint. The remaining episodes follow a plan of the model to the goal, with less noise.
 """
 
 from collections import deque

@@ -1,15 +1,16 @@
 """Chooses a swing-up's gains, catch region and regulator by simulated trials of a model, in one compiled program.
 
-1. Numbers without units (`swing_up.RANGES`) are drawn; scales of the model turn them into gains and a regulator. 2.
-Every set is tried from near hanging, with the hardware's limits, resolution, noise and delay, and with motors that are
-stronger or weaker than in the model. The weight differs in the opposite direction, by the share `WEIGHT` of this error.
-Stronger motors also act later, by the share `LATE` of a sample. 3. The best sets are tried again with more errors, and
-from more starts. The margin of a set is the largest error up to which every trial succeeds. The candidates come up from
-most starts, have the largest margin and are not much slower than the fastest. The chosen set changes its controls least
-at the goal. 4. Plans with feedback (`planned`) are tried first, and chosen if they tolerate every error. Otherwise
-energy laws are tried too, with correct models in the first round, because few sets work. An energy law with a margin of
-`LEAST` or more is chosen, because it acts in any state, and a wrong model makes it slower but makes a plan fail.
-Otherwise the larger margin decides. For recovery from pushes by plans, repeated plans are tried instead.
+1. Numbers without units (`swing_up.RANGES`) are drawn; scales of the model turn them into gains and a regulator.
+2. Every set is tried from near hanging, with the hardware's limits, resolution, noise and delay, and with motors that
+   are stronger or weaker than in the model. The weight differs in the opposite direction, by the share `WEIGHT` of this
+   error. Stronger motors also act later, by the share `LATE` of a sample.
+3. The best sets are tried again with more errors, and from more starts. The margin of a set is the largest error up to
+   which every trial succeeds. The candidates come up from most starts, have the largest margin and are not much slower
+   than the fastest. The chosen set changes its controls least at the goal.
+4. Plans with feedback (`planned`) are tried first, and chosen if they tolerate every error. Otherwise energy laws are
+   tried too, with correct models in the first round, because few sets work. An energy law with a margin of `LEAST` or
+   more is chosen, because it acts in any state, and a wrong model makes it slower but makes a plan fail. Otherwise the
+   larger margin decides. For recovery from pushes by plans, repeated plans are tried instead.
 """
 
 from collections.abc import Callable, Mapping

@@ -7,7 +7,7 @@ There are four methods. `least_work` chooses one before tracing, by its number o
   in the plane, and small or long ones in space;
 - `sparse` Cholesky by tiles after nested dissection for other systems of any stiffness;
 - `matrix_free` conjugate gradients with a block-Jacobi preconditioner on the element Hessians, for soft bodies in small
-time steps, and for systems with too large a factor for the memory.
+  time steps, and for systems with too large a factor for the memory.
 
 The number of products in conjugate gradients depends on stiffness, Poisson's ratio, time step and mesh. It grows with
 the square root of the condition number, and can be counted for known values only.
