@@ -35,7 +35,7 @@ from dln_jax.types import InputError, require_positive
 
 STEP_LENGTHS = (1.0, 0.3)
 BARRIER = 1e-3
-"""Default μ, in units of the cost: a control stays μ / p away from a limit with multiplier p."""
+"""Default μ, in units of the cost: a control stays μ / p away from a limit with multiplier p per unit."""
 PRICES = 1e3, 1e3
 """Prices (w_1, w_2) of the constraints of problems without `soft`."""
 MIN_DAMPING, MAX_DAMPING = 1e-9, 1e9

@@ -155,8 +155,7 @@ def region_of_attraction(
     starts: int = 64,
     key: Array | None = None,
 ) -> Region:
-    """Returns the largest level with simulations that reach the goal from all random starts on its surface, up to this
-    level.
+    """Returns the largest level with only successful simulations from random starts on its surface and below it.
 
     Args:
         field: (x, u) -> dx/dt of the plant.

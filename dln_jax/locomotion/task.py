@@ -172,8 +172,8 @@ def make_task(
         scene = creature_scene(creature, bumps)
     elif scene.mesh.vertices.shape != vertices.shape or "gravity" not in scene.params.terms or bumps is not None:
         raise InputError(
-            "the scene does not suit the task; expected the creature's mesh, a term 'gravity', and no rough ground "
-            "(only for the published ground)"
+            "the scene does not suit the task; expected the creature's mesh and a term 'gravity' (rough ground needs "
+            "the published ground)"
         )
     frame = fitted_frame(vertices) if frame is None else frame
     stepper = make_step(scene, dt)

@@ -242,7 +242,7 @@ def _by_term(scene: SoftScene, control: Any) -> Callable[[str], Any]:
     if not isinstance(control, Mapping):
         if len(driven) != 1:
             several = f"the actuators {', '.join(driven)}; pass a dict of arrays by these names"
-            none = "no actuator; leave the control out, or leave out the value of a term"
+            none = "no actuator; pass no control, or leave out a term's value to control it"
             raise InputError(f"the control is one array, but the scene has {several if driven else none}")
         return {driven[0]: control}.get
     if unknown := [name for name in control if name not in driven]:

@@ -5,9 +5,9 @@ The plant falls from its goal at the rate f, and a motor at its limit accelerate
     lambda = max(f, √(a / π))  1/s,    sizes r: π for a joint that turns freely, half the range of a limited one, else
                                        3 max(a, g) / lambda²
 
-    q(x) = sum w π² sin²((θ - θ0)/2)  or  w (x - x0)²,  and v qd²,  + barriers of limited coordinates w = 1 for angles
-    (1/2 with a motor), 5 / r² for slides,   v = 1 / lambda² and 2 / (lambda r)² g(u) is a limited-control cost: half of
-    all limits together cost effort π², if hanging costs π²
+    q(x) = sum w π² sin²((θ - θ0)/2)  or  w (x - x0)²,  and v qd²,  + barriers of limited coordinates
+    w = 1 for angles (1/2 with a motor), 5 / r² for slides,   v = 1 / lambda² and 2 / (lambda r)²
+    g(u): cost of limited controls; half of all limits together cost effort π², if hanging costs π²
 
 The box contains the whole circle or range, and rates up to 2.4 lambda, or for slides up to the reach of the motor.
 Times of the fit and of the discount are multiples of 1 / lambda.

@@ -96,7 +96,7 @@ def volumes(mesh: Mesh) -> Float[np.ndarray, " m"]:
 
 
 def boundary(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
-    """Returns the facets of a single element, oriented outwards.
+    """Returns the boundary facets, with the body on one side only, oriented outwards.
 
     An edge [a, b] in the plane has the body on its left and the outward normal (yb - ya, xa - xb). A triangle [a, b, c]
     in space has the outward normal (b - a) x (c - a).
