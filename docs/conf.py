@@ -53,6 +53,7 @@ add_module_names = False
 toc_object_entries = False  # the contents of every page would hold every function: half of the time of a build
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
+copybutton_exclude = ".linenos, .gp, .go"  # an example is copied without its prompts and output
 python_use_unqualified_type_names = True
 
 html_theme = "furo"
@@ -244,7 +245,9 @@ def to_rst(app, what, name, obj, options, lines):
 
 
 def escaped(line):
-    """A line with what reStructuredText would read as markup escaped, outside of `code`."""
+    """A line with what reStructuredText would read as markup escaped, outside of `code` and of an example's code."""
+    if line.lstrip().startswith((">>> ", "... ")):
+        return line
     parts = re.split(r"(`[^`]*`)", line)
     return "".join(part if index % 2 else re.sub(r"([|*]|_(?!\w))", r"\\\1", part) for index, part in enumerate(parts))
 

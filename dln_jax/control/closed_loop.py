@@ -1,10 +1,10 @@
 """Closed loop of a continuous-time plant and a sampled controller, including the effects of the hardware.
 
-At every sample the controller receives the measured coordinates and returns controls. These are limited, delayed by
-whole samples, disturbed by noise and held until the next sample, while the classical Runge-Kutta method integrates the
-plant. `vmap` over starts and keys simulates many runs in one program; `outcomes` evaluates the runs of a pole.
+At every sample the controller receives the measured coordinates and returns controls. The loop limits them, delays them
+by whole samples, adds noise and holds them until the next sample. The classical Runge-Kutta method integrates the
+plant. `vmap` over starts and keys simulates many runs in one program. `outcomes` evaluates runs with a pole.
 
-If a control or a measurement is not finite, the controls and everything after them are NaN: a failure is never hidden.
+If a control or a measurement is not finite, the controls and everything after them are NaN, so no failure stays hidden.
 """
 
 from collections.abc import Callable
@@ -48,7 +48,7 @@ class Hardware(NamedTuple):
     delay: int = 0
     """Delay of the controls in samples."""
     sees_rates: bool = True
-    """Whether the controller also receives qd, without noise; otherwise y = q."""
+    """True if the controller also receives qd, without noise; otherwise y = q."""
 
 
 class ClosedLoopRun(NamedTuple):
@@ -64,7 +64,7 @@ class ClosedLoopRun(NamedTuple):
 
 
 class Push(NamedTuple):
-    """A push: a jump of the rates, as after a short blow."""
+    """A push: a jump of the rates, as after an impact."""
 
     seconds: float
     """Time of the push, s."""
@@ -123,9 +123,9 @@ def simulate(
         rate: sampling rate, Hz.
         controls: m, number of controls.
         hardware: limits, noise, delay.
-        key: random key of the noise; required if there is any.
-        substeps: integrator steps per sample; `None` if `field` is another simulator's (x, u) -> x a sample later.
-        push: acts before the measurement of its sample; by default none.
+        key: random key of the noise; required with noise.
+        substeps: integrator steps per sample; `None` if `field` is a simulator (x, u) -> x one sample later.
+        push: applied before the measurement of its sample; by default none.
 
     Raises:
         InputError: a setting is out of range, or there is noise without a key.
@@ -135,7 +135,7 @@ def simulate(
     if delay < 0 or delay != int(delay):
         raise InputError(f"delay is {delay}; expected a whole number of samples, 0 or more")
     if key is None and _noisy(hardware):
-        raise InputError("the hardware has noise; give a key of jax.random, a new one for each run")
+        raise InputError("the hardware has noise; give a jax.random key, a new one for each run")
     key = jax.random.key(0) if key is None else key
     step = field if substeps is None else integrated(field, dt, substeps=substeps)
     x = jnp.asarray(x, float)
@@ -166,7 +166,7 @@ def measured(hardware: Hardware, x: Array, key: Array) -> Array:
 
 
 def encoded(hardware: Hardware, q: Any, normal: Any) -> Any:
-    """Returns the encoders' readings of q [d] with a draw of the standard normal distribution, or with `None`."""
+    """Returns the encoder readings of q [d]; the noise is a standard normal draw, or `None`."""
     xp = np if isinstance(q, np.ndarray) else jnp
     if normal is not None:
         q = q + hardware.encoder_noise * normal
@@ -175,7 +175,7 @@ def encoded(hardware: Hardware, q: Any, normal: Any) -> Any:
 
 
 def delivered(hardware: Hardware, queue: Array, command: Array, key: Array) -> tuple[Array, Array]:
-    """Returns the controls that act now, and the queue [delay, m] of delayed controls after adding the command."""
+    """Returns the controls that act now, and the queue [delay, m] of delayed controls with the new command."""
     queue = jnp.concatenate([queue, saturated(command, hardware.lower, hardware.upper)[None]])
     u = queue[0]
     if _noisy(hardware):
@@ -192,9 +192,9 @@ class Outcomes(NamedTuple):
     """Outcomes of n runs."""
 
     seconds: Float[np.ndarray, " n"]
-    """Time in s after which the pole stays upright until the end; infinite if it does not."""
+    """Time in s from which the pole stays upright until the end; infinite if it does not."""
     failed: Bool[np.ndarray, " n"]
-    """Whether a run contains values that are not finite; such values do not count as upright."""
+    """True for runs with non-finite values, which do not count as upright."""
 
     @property
     def share(self) -> float:
@@ -203,19 +203,19 @@ class Outcomes(NamedTuple):
 
     @property
     def median(self) -> float:
-        """Median time of the runs that end upright, s; infinite if none does."""
+        """Median time of the runs that end upright, s; infinite without any."""
         return float(np.median(self.seconds[np.isfinite(self.seconds)])) if self.share else np.inf
 
     @property
     def worst(self) -> float:
-        """Longest time of the runs that end upright, s; infinite if none does."""
+        """Longest time of the runs that end upright, s; infinite without any."""
         return float(np.max(self.seconds[np.isfinite(self.seconds)])) if self.share else np.inf
 
 
 def outcomes(angle: Any, *, rate: float, up: float = UP) -> Outcomes:
     """Evaluates the angles of a pole from upright [n, N+1], rad, at the samples of n runs.
 
-    An angle that is not finite does not count as upright.
+    A non-finite angle does not count as upright.
     """
     angle = np.asarray(angle)
     near = np.cos(angle) > np.cos(up)  # NaN is not

@@ -2,9 +2,9 @@
 
     L = sum_k l(x_k, u_k) + l_N(x_N) + sum_k λ_{k+1}·(f(x_k, u_k) - x_{k+1}) + z·c + ν·h(x_N),   c <= 0, h = 0
 
-The order of c is that of `control.constraints`. An inequality c - t + s = 0 has a slack s > 0 with multiplier z. A soft
-one also has an excess t > 0 with multiplier y, which costs w_1 t + w_2 t² / 2. The conditions s z = μ and t y = μ
-eliminate slacks and excesses, which leaves a quadratic program over the horizon.
+c is ordered as in `control.constraints`. An inequality c - t + s = 0 has a slack s > 0 with multiplier z. A soft
+inequality also has an excess t > 0 with multiplier y, at the cost w_1 t + w_2 t² / 2. The conditions s z = μ and t y =
+μ eliminate slacks and excesses, which leaves a quadratic program over the horizon.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from dln_jax.control.riccati import Horizon, HorizonSolution, least_cost
 from dln_jax.control.trajectories import TrajectoryProblem, knots_of
 
 END_COMPLIANCE = 1e-8
-"""Compliance of the equations of the end in the linear systems; it does not change the solution."""
+"""Regularisation of the end equations in the linear systems; it does not change the solution."""
 
 
 class Values(NamedTuple):
@@ -46,7 +46,7 @@ class Slopes(NamedTuple):
 
 
 class Conditions(NamedTuple):
-    """Functions of a trajectory x [N+1, n], u [N, m], whose cost is multiplied by a scale."""
+    """Functions of a trajectory x [N+1, n], u [N, m], with the cost multiplied by a scale."""
 
     values: Callable[[Array, Array], Values]
     slopes: Callable[[Array, Array], Slopes]
@@ -114,7 +114,7 @@ def conditions(
 
 
 def split(rows: Array, steps: int, end_size: int) -> tuple[Array, Array]:
-    """Splits a vector [M] into the rows of the steps [N, P] and those of the end [E]."""
+    """Splits a vector [M] into rows of the steps [N, P] and rows of the end [E]."""
     cut = len(rows) - end_size
     return rows[:cut].reshape(steps, -1), rows[cut:]
 
@@ -160,7 +160,7 @@ class Inequalities(NamedTuple):
     elastic: Array
     """Soft inequalities."""
     strict: Array
-    """Limits of controls and durations, which no iterate may leave."""
+    """Limits of controls and durations, which every iterate respects."""
     linear: Any
     square: Any
 
@@ -253,7 +253,7 @@ def newton(
 
 
 def to_boundary(of: Inequalities, at: Iterate, step: Iterate, share: Array) -> tuple[Array, Array]:
-    """Returns the longest step lengths, at most one, that use up at most `share` of s and t, and of z and y."""
+    """Returns the longest step lengths, at most one, that take at most `share` of s and t, and of z and y."""
 
     def longest(*pairs: tuple[Array, Array, Array]) -> Array:
         fastest = [jnp.max(jnp.where(mask, -d / v, 0.0), initial=0.0) for v, d, mask in pairs]

@@ -1,9 +1,9 @@
-"""The constraints of a trajectory problem, named and numbered in one place for solvers, checks and verdicts.
+"""The constraints of a trajectory problem: names and order for solvers, checks and verdicts.
 
-The vector c [M] of inequalities c <= 0 has, for every step, limits of the controls, path constraints, limits of the
-states and constraints on the states; then the limits of the last state, constraints on it and those of the end, and
-last h and -h for the equations h = 0 of the end, which replace them where violations are minimised. Limits and
-constraints of the first state are masked: no control changes them.
+The vector c [M] of inequalities c <= 0 starts, for every step, with limits of the controls, path constraints, limits of
+the states and constraints on the states. Then come the limits and constraints of the last state and of the end. The
+rows h and -h come last; they replace the equations h = 0 of the end when violations are minimised. Limits and
+constraints of the first state are masked, because no control changes them.
 """
 
 from collections.abc import Callable
@@ -28,16 +28,16 @@ class Rows(NamedTuple):
     """Constraints of one kind at a step or at the end."""
 
     name: str
-    """Text with the places {i} for the component and {k} for the step or knot."""
+    """Name, with the placeholders {i} for the component and {k} for the step or knot."""
     values: Callable[..., Array]
     """(x [n], u [m], row of the knot, if any) -> [r]; at the end u is `None`."""
     components: np.ndarray
     """Number of the component that each row limits [r]."""
     present: Array
-    """False for limits that turned out to be infinite [r]."""
+    """False for infinite limits [r]."""
     kind: Literal["limit", "constraint", "equation"]
     of_state: bool = True
-    """Whether the rows do not depend on the controls."""
+    """True if the rows do not depend on the controls."""
 
 
 class Kinds(NamedTuple):
@@ -54,11 +54,11 @@ class Kinds(NamedTuple):
 
 
 def rows_of(problem: TrajectoryProblem, n: int, m: int) -> tuple[list[Rows], list[Rows]]:
-    """Returns the rows of a step and those of the end, for n states and m controls."""
+    """Returns the rows of a step and the rows of the end, for n states and m controls."""
     _, last = knots_of(problem)
 
     def limit(name: str, sign: int, bound: Any, size: int, of_state: bool) -> Rows:
-        # Traced limits may turn out to be infinite; their rows are then masked.
+        # Rows of infinite traced limits are masked.
         traced = isinstance(bound, Tracer)
         index = np.arange(size) if traced else np.flatnonzero(np.broadcast_to(np.isfinite(bound), size))
         chosen = lambda: jnp.broadcast_to(jnp.asarray(bound, float), size)[index]  # noqa: E731
@@ -123,7 +123,7 @@ def kinds_of(problem: TrajectoryProblem, shape: tuple[int, int, int]) -> Kinds:
 
 
 def with_limits_of(problem: TrajectoryProblem, robot: Robot) -> TrajectoryProblem:
-    """Returns the problem with the limits of a robot's file, for x = (q, qd) and a motor per joint."""
+    """Returns the problem with the limits of a robot file, for x = (q, qd) and a motor per joint."""
     speed = np.broadcast_to(np.asarray(robot.velocity_limits, float), len(robot.position_limits))
     (low, high), (weakest, strongest) = robot.position_limits.T, robot.force_limits.T
     return problem._replace(
@@ -140,7 +140,7 @@ def free_time(
     shortest: float,
     longest: float,
 ) -> TrajectoryProblem:
-    """Returns a problem whose steps share an unknown duration dt: an additional last state, free at the start.
+    """Returns a problem with an unknown duration dt of all steps: an additional last state, free at the start.
 
     The states are (x, dt), also in `final_cost` and in constraints added by `_replace`.
 
@@ -170,12 +170,12 @@ def free_time(
 
 
 def worst_violation(problem: TrajectoryProblem, plan: Plan, *, tolerance: float = 1e-6) -> str:
-    """Returns a sentence that names the constraint that a plan violates most, and by how much.
+    """Returns a sentence with the most violated constraint of a plan and its violation.
 
     Args:
         problem: the solved problem.
         plan: `solution.plan` of `shoot`, or a plan of `mpc`.
-        tolerance: violations up to this count as none.
+        tolerance: largest accepted violation.
     """
     if not all(np.isfinite(array).all() for array in (plan.x, plan.u)):
         return "the plan is not finite"
@@ -204,7 +204,7 @@ def worst_violation(problem: TrajectoryProblem, plan: Plan, *, tolerance: float 
 
 
 def require_start(problem: TrajectoryProblem, x: Any, m: int) -> None:
-    """Raises `InputError` if a known start is outside limits or constraints, because no control changes it."""
+    """Raises `InputError` if a known start is outside limits or constraints; no control can change it."""
     if isinstance(x, Tracer) or not np.isfinite(x).all():
         return
     x = np.asarray(x, float)
@@ -219,7 +219,7 @@ def require_start(problem: TrajectoryProblem, x: Any, m: int) -> None:
             continue
         for i in np.flatnonzero(counted & (excess > 0))[:1]:
             name = one.name.format(i=one.components[i], k=0)
-            raise InputError(f"the start violates {name} by {excess[i]:.6g}; start where it holds")
+            raise InputError(f"the start violates {name} by {excess[i]:.6g}; choose a start inside")
 
 
 def require_end(problem: TrajectoryProblem, n: int, m: int) -> None:
@@ -234,7 +234,7 @@ def require_end(problem: TrajectoryProblem, n: int, m: int) -> None:
             for i, least in enumerate(_least(problem, one, *limits)):
                 if least > ROUNDING:
                     raise InputError(
-                        f"{one.name.format(i=i, k='N')} misses zero by {least:.6g} or more within the limits of the "
+                        f"{one.name.format(i=i, k='N')} is at least {least:.6g} from zero within the limits of the "
                         "states; widen the limits, or move the end"
                     )
 

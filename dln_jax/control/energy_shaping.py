@@ -1,13 +1,13 @@
 """Energy laws for plants with passive joints, from known or learned models.
 
 Collocated partial feedback linearisation gives the active joints any acceleration a (Spong 1995, "The swing up control
-problem for the acrobot"). The passive rows of the equations of motion, which have no motors, determine the other
-accelerations. With h = c + g + friction,
+problem for the acrobot"). The passive rows of the equations of motion determine the other accelerations. With h = c + g
++ friction,
 
     qdd_p = -M_pp⁻¹ (M_pa a + h_p),   tau_a = M_aa a + M_ap qdd_p + h_a
 
 The passive part, with the active joints locked, has the energy E = ½ qd_pᵀ M_pp qd_p + V. Accelerating the active
-joints does work on it at the rate -qd_pᵀ M_pa a, so a = k (E - E*) M_ap qd_p drives E to the energy E* of the goal.
+joints adds power -qd_pᵀ M_pa a, so a = k (E - E*) M_ap qd_p drives E to the energy E* of the goal.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,7 +27,7 @@ class EnergyGains(NamedTuple):
     """Gains of the accelerations of the active joints."""
 
     energy: float
-    """k, 1/(kg m² J s) for revolute joints; maps M_ap qd_p times the energy error to an acceleration."""
+    """k, 1/(kg m² J s) for revolute joints: factor from M_ap qd_p times the energy error to an acceleration."""
     proportional: float
     """1/s²."""
     derivative: float
@@ -55,7 +55,7 @@ def parts_of(actuation: Any) -> Parts:
     active = tuple(np.flatnonzero(driven).tolist())
     if B.ndim != 2 or (driven > 1).any() or ((B != 0).sum(axis=0) != 1).any() or len(active) == len(B):
         raise InputError(
-            f"actuation is {B.tolist()}; expected one coordinate per motor, and a coordinate without a motor"
+            f"actuation is {B.tolist()}; expected one coordinate per motor, and at least one passive coordinate"
         )
     return Parts(active, tuple(np.setdiff1d(np.arange(len(B)), active).tolist()))
 
@@ -75,7 +75,8 @@ def partial_linearisation(plant: Dynamics, parts: Parts) -> Callable[[Vector, Ve
 
 
 def passive_energy(plant: Dynamics, parts: Parts, goal: Any) -> Callable[[Vector, Vector], Scalar]:
-    """Returns (q, qd) -> energy of the passive part above the goal's, J, with the active joints locked at the goal."""
+    """Returns (q, qd) -> energy of the passive part relative to the goal, J, with the active joints locked at the
+    goal."""
     active, passive = map(np.array, parts)
     goal = jnp.asarray(goal, float)
 
@@ -102,7 +103,7 @@ def energy_shaping(
         parts: driven and passive joints.
         goal: posture [d].
         gains: gains of the accelerations.
-        surplus: target energy of the passive joints above that of the goal, J, to compensate their losses.
+        surplus: target energy of the passive joints above the goal, J, to compensate their losses.
 
     Raises:
         InputError: the model has no energy.
@@ -128,5 +129,5 @@ def energy_shaping(
 def with_energy(model: Dynamics | InverseForward) -> Dynamics:
     """Returns the model if it has an energy; raises `InputError` otherwise."""
     if not isinstance(model, Dynamics):
-        raise InputError("the model has no energy for an energy law to shape; train one that has, such as a DeLaN")
+        raise InputError("the model has no energy, but the energy law needs one; train a DeLaN, for example")
     return model

@@ -2,13 +2,13 @@
 
 Riccati's recursion solves Newton steps on the optimality conditions while the barrier μ falls to zero (Fiacco and
 McCormick 1968). As in IPOPT (Wächter and Biegler 2006, with its constants), a filter of violation and barrier function
-accepts steps; if the longest step raises the violation, a second-order correction is tried. The Hessian is damped until
-the recursion's pivots are positive. The damping is remembered, and rises if no step is accepted.
+accepts steps. If the longest step raises the violation, a second-order correction is tried. The Hessian is damped until
+the pivots of the recursion are positive. The damping carries over to the next step, and rises if no step is accepted.
 
-If inequalities cut several steps in a row short, or no step is accepted, slacks are widened, except those of limits of
-controls and durations: the inequalities may then be violated on the way, like the other constraints. A stationary point
-counts as a minimum if its undamped pivots are positive. At a saddle, the last step follows a direction of negative
-curvature of the Lagrangian (by an inverse iteration from noise).
+If inequalities shorten several steps in a row, or no step is accepted, slacks are widened. The inequalities may then be
+violated on the way, except for limits of controls and durations. A stationary point counts as a minimum if its undamped
+pivots are positive. At a saddle, the last step follows a direction of negative curvature of the Lagrangian (by an
+inverse iteration from noise).
 """
 
 from collections.abc import Callable
@@ -41,21 +41,21 @@ FIRST_BARRIER, BARRIER_FACTOR, BARRIER_POWER, BARRIER_RATIO = 0.1, 0.2, 1.5, 10.
 FIRST_SLACK = 1e-2
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-20, 1e12
 TO_BOUNDARY = 0.99
-"""A step may go this share of the way to the boundary, and more as μ falls."""
+"""Largest share of the way to the boundary in a step; it grows as μ falls."""
 VIOLATION_MARGIN, BARRIER_MARGIN, ARMIJO = 1e-5, 1e-8, 1e-8
 SMALL_VIOLATION, LARGE_VIOLATION = 1e-4, 1e4
-"""Violations relative to the first: below the small one the barrier function must fall; none above the large one is
-accepted."""
+"""Limits of the violation relative to the first one. Below the small limit the barrier function must fall; the large
+limit is never exceeded."""
 MULTIPLIER_SPREAD = 1e10
 """Largest ratio of s z to μ, and of μ to s z."""
 MOST_HALVINGS = 24
 FILTER = 64
-"""Number of pairs that the filter remembers; the oldest are forgotten."""
+"""Largest number of pairs in the filter; the oldest are dropped."""
 SHORT, MOST_SHORT, MOST_RELEASES = 0.02, 4, 10
-"""Length below which a step counts as cut short by inequalities, number of short or failed steps in a row after which
-slacks are widened, and largest number of times that this is done."""
+"""Length of a step that counts as short, number of short or failed steps in a row before slacks are widened, and
+largest number of such widenings."""
 CURVATURE = 1e-6
-"""Negative curvature up to this counts as zero, relative to the largest second derivative if that is above one."""
+"""Negative curvature up to this counts as zero; relative to the largest second derivative if it exceeds one."""
 ROUNDING = 2.2e-16
 
 
@@ -65,16 +65,16 @@ class Search(NamedTuple):
     at: Iterate
     values: Values
     change: HorizonSolution
-    """The last step; its gains are those of the plan."""
+    """The last step; the plan takes its gains."""
     barrier: Array
     damping: Array
-    """Damping that was needed last."""
+    """Last damping needed."""
     least: Array
     """Initial damping of the next step: positive after a failed search."""
     filter: Array
     entries: Array
     largest: Array
-    """Largest violation that is accepted."""
+    """Largest accepted violation."""
     short: Array
     """Number of short or failed steps in a row."""
     releases: Array
@@ -110,7 +110,7 @@ def search(
         def wanted(carry: tuple[Any, Array, Array]) -> Array:
             return ~carry[0][0].convex & (carry[1] < MOST_DAMPING)
 
-        # The loop starts without a solution, so that the step is compiled once.
+        # The loop starts without a solution, so the step is compiled once.
         none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(solve, search.least))
         return jax.lax.while_loop(wanted, more, (none, search.least, jnp.asarray(0)))[:2]
 
@@ -140,7 +140,7 @@ def search(
         share = jnp.maximum(TO_BOUNDARY, 1 - barrier)
         gap = gaps(rows, at, values)
 
-        # Once converged, the step only serves to find a direction of negative curvature.
+        # After convergence, the step only searches for a direction of negative curvature.
         pulls = slopes._replace(cost=jnp.where(done, noise, slopes.cost),
                                 end_cost=jnp.where(done, end_noise, slopes.end_cost))  # fmt: skip
         bent = CURVATURE * jnp.maximum(1.0, jnp.max(jnp.abs(curved[0])))
@@ -215,7 +215,7 @@ def search(
             at, values, change, barrier, jnp.where(good, used, raised), jnp.where(good, 0.0, raised), filtered,
             entries + keep, search.largest, short, releases, search.iterations + ~done, plain, ending,
         )  # fmt: skip
-        # How far below zero the whole step would take the slacks.
+        # Depth below zero of the slacks after the whole step.
         wanted = jnp.max(jnp.where(present & ~rows.strict, -(search.at.s + step.s), 0.0), initial=0.0)
         return jax.lax.cond(release, released, lambda after, _: after, after, wanted)
 

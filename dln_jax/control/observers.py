@@ -1,12 +1,12 @@
-"""Controllers with incomplete measurements: rates by differences of encoder readings, and states by Kalman filters.
+"""Controllers with incomplete measurements: rates from encoder differences, and states from Kalman filters.
 
 A late measurement belongs to an earlier state. The memory of `with_estimate` holds the belief at the time of the most
-delayed channel, and the measurements and controls since then. At every sample the filter goes through them again, so
-that each measurement is used at its own time, and prompt channels at once. The law receives the state predicted for the
-moment at which its control begins to act.
+delayed channel, and all later measurements and controls. At every sample the filter repeats them, so each measurement
+enters at its own time, and prompt channels enter at once. The law receives the state predicted for the time when its
+control begins to act.
 
-Samples of hardware are never exactly on time. The filter uses their own times: the prediction over a step of length
-(1 + e) h, h = 1 / rate, is x + (1 + e) (step(x) - x), with the error ½ e (1 + e) h² d²x/dt².
+Hardware samples are never exactly on time. The filter uses their actual times: the prediction over a step of length (1
++ e) h, h = 1 / rate, is x + (1 + e) (step(x) - x), with the error ½ e (1 + e) h² d²x/dt².
 """
 
 from collections.abc import Callable, Sequence
@@ -41,9 +41,10 @@ def with_differences(law: Law | Controller, d: int, *, rate: float, cutoff: floa
         d: number of coordinates.
         rate: sampling rate, Hz.
         cutoff: cut-off frequency of the low-pass, Hz.
-        order: order of the differences; 1 is late by half a sample, 2 is not but amplifies encoder noise more.
+        order: order of the differences. Order 1 is late by half a sample; order 2 is on time but amplifies encoder
+            noise more.
 
-    A measurement that is not finite reaches the law, and the rates continue without it.
+    A non-finite measurement reaches the law, and the rates continue without it.
 
     Raises:
         InputError: the rate or the cut-off is not positive, or the order is neither 1 nor 2.
@@ -80,17 +81,17 @@ def with_estimate(
     late: Sequence[int] | int = 0,
     every: Sequence[int] | int = 1,
 ) -> Controller:
-    """Gives a law the states that a Kalman filter estimates from measurements, instead of differences of readings.
+    """Returns a controller that estimates the states for a law by a Kalman filter instead of differences.
 
     Args:
         law: x [n] -> u, or a controller with such measurements.
         process: such as `mechanical(...)`.
         belief: belief in the state before the first measurement.
-        rate: nominal sampling rate, Hz; the filter uses the times with which the controller is called.
+        rate: nominal sampling rate, Hz; the filter uses the times given to the controller.
         controls: m.
-        lower: lower limits of the controls, which the filter must know.
+        lower: lower limits of the controls, for the filter.
         upper: upper limits.
-        delay: samples after which a control begins to act; it need not be a whole number.
+        delay: delay of the controls in samples, whole or fractional.
         late: delays of the channels of y in samples, one per channel or one for all.
         every: samples between new measurements of a channel, from the first sample on, one per channel or one for all;
             values in between are ignored.
@@ -112,7 +113,7 @@ def with_estimate(
     rows = window - 1 - lag, np.arange(channels)
 
     def acting(u: Array, lengths: Array) -> Array:
-        """Returns the mean controls over the steps of the window, and over those before the next control acts."""
+        """Returns the mean controls over the steps of the window, and over the steps before the next control acts."""
         lengths = jnp.concatenate([lengths, jnp.ones(wait, lengths.dtype)])
         early = jnp.cumsum(jnp.append(0.0, 1 - lengths))
         step = jnp.arange(window + wait)
@@ -179,11 +180,11 @@ def by_differences(layout: Layout) -> Estimator:
 
 
 def by_filter(layout: Layout, process: Process, *, delay: int | float = 0) -> Estimator:
-    """Returns an estimator of the states by a filter of the measurements, which uses their times.
+    """Returns an estimator of the states by a filter that uses the times of the measurements.
 
     Args:
         layout: layout of the plant.
-        process: such as that of `estimate.from_log`.
+        process: for example from `estimate.from_log`.
         delay: samples after which a control begins to act.
     """
     lower, upper = layout.limits.control.T
@@ -210,5 +211,5 @@ def estimator_of(name: str, layout: Layout, process: Process | None, *, delay: i
     if name == "differences":
         return by_differences(layout)
     if process is None:
-        raise InputError(f"the filter {name!r} needs a process, such as that of estimate.from_log")
+        raise InputError(f"the filter {name!r} needs a process, for example from estimate.from_log")
     return by_filter(layout, process._replace(unscented=name == "unscented"), delay=delay)

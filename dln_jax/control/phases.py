@@ -1,10 +1,10 @@
 """The phases of `shoot`: searches for a minimum, escapes from saddles, and restoration.
 
 If a search ends at a saddle, the next one starts beside it, along a direction of negative curvature of the Lagrangian.
-If a search gives up where hard constraints are violated, the next one minimises the sum of violations of all hard
-constraints except the steps and the limits of controls and durations (the restoration phase of Wächter and Biegler
-2006, section 3.3). If it reaches a point where they hold, the search for a minimum continues from there; if it
-converges elsewhere, the violation is stationary and the problem is locally infeasible.
+If a search gives up with violated hard constraints, the next one minimises the sum of their violations, except for the
+steps and the limits of controls and durations (the restoration phase of Wächter and Biegler 2006, section 3.3). If it
+reaches a feasible point, the search for a minimum continues from there. If it converges elsewhere, the violation is
+stationary and the problem is locally infeasible.
 """
 
 from collections.abc import Callable
@@ -19,10 +19,10 @@ from dln_jax.control.interior_point import Search, Trial, search, started
 from dln_jax.solvers.ending import Ending
 
 RESTORING = 1e-6
-"""Weight of the cost while violations are minimised, to decide between points of equal violation. Constraints whose
-multipliers are below its inverse are met if possible."""
+"""Weight of the cost during the minimisation of violations, to choose between points of equal violation. Constraints
+with multipliers below its inverse are met if possible."""
 PRICE = 10.0
-"""Price of the limits of states in the sum of violations; other constraints have price one."""
+"""Price of state limits in the sum of violations; other constraints have price one."""
 STATIONARY = 1e-6
 """Smallest tolerance for a minimum of the violations."""
 MOST_ESCAPES, MOST_RESTORATIONS = 3, 2
@@ -31,7 +31,7 @@ WAY = 0.1
 
 
 class Phase(NamedTuple):
-    """The start of the next search, and the last search."""
+    """State between two searches."""
 
     x: Array
     u: Array
@@ -50,8 +50,8 @@ def phases(
 ) -> tuple[Search, Array]:  # fmt: skip
     """Runs all phases from states x [N+1, n] and controls u [N, m]; soft constraints have the weights w_1, w_2.
 
-    `of` takes the weight of the cost, and one, or zero if rows replace the equations of the end. Returns the last
-    search and the weight of its cost.
+    `of` takes the weight of the cost, and one (zero if rows replace the equations of the end). Returns the last search
+    and the weight of its cost.
     """
     kinds = of(jnp.ones(()), jnp.ones(())).kinds
     limited = kinds.soft & (soft is not None)

@@ -1,22 +1,21 @@
 """Model predictive control with constraints in real time: one iteration per sample, with a fixed number of operations.
 
-At a sample, `feedback` computes the control from the measured state and the gains of the plan, by a product of a matrix
-and a vector. Then, until the next sample, `prepare` follows the plan from the measured state, shifts it by a step, and
-improves it by an iteration of single shooting (the split is that of Diehl, Bock and Schlöder 2005). The iteration
-solves a smooth problem, with barriers for the limits of the controls and prices for all other constraints c <= 0:
+At a sample, `feedback` computes the control from the measured state and the gains of the plan, by one matrix-vector
+product. Until the next sample, `prepare` follows the plan from the measured state, shifts it by a step, and improves it
+by an iteration of single shooting. The split follows Diehl, Bock and Schlöder (2005). The iteration solves a smooth
+problem, with barriers for the limits of the controls and prices for all other constraints c <= 0:
 
     -μ log(-c)   and   min_t  w_1 t - μ log t - μ log(t - c)  +  w_2 max(c, 0)² / 2
 
-Barriers keep controls inside their limits. Prices are those of soft constraints with slacks (Fiacco and McCormick
-1968): as μ falls, the minimum approaches w_1 max(c, 0), which is exact where the multiplier is below w_1. With
-h = μ / w_1 and the smoothed distance d = (√(c² + 4 h²) - c) / 2 its slope is μ / (d + h); a barrier has h = 0 and
-d = -c. These slopes act at any distance, and a far obstacle would move the plan away from its goal. So they are
-multiplied by (1 - d / D)², and are zero beyond a distance D: a tenth of the range of a limit, or 0.1 in the units of
-any other constraint. So every sample has a plan, which needs no memory of multipliers and states whether it violates a
-constraint.
+Barriers keep controls inside their limits. Prices are the costs of soft constraints with slacks (Fiacco and McCormick
+1968): as μ falls, the minimum approaches w_1 max(c, 0), which is exact where the multiplier is below w_1. With h = μ /
+w_1 and the smoothed distance d = (√(c² + 4 h²) - c) / 2 the slope is μ / (d + h); a barrier has h = 0 and d = -c. These
+slopes act at any distance, so a far obstacle would move the plan away from its goal. A factor (1 - d / D)² makes them
+zero beyond a distance D: a tenth of the range of a limit, or 0.1 in the units of any other constraint. Every sample
+then has a plan that needs no memory of multipliers and states whether it violates a constraint.
 
-An iteration is that of a Gauss-Newton regulator (Li and Todorov 2004) by Riccati's recursion. It takes the best of
-several step lengths, each giving a motion, and raises the damping of the controls' Hessian if none lowers the cost.
+An iteration is a Gauss-Newton step (iterative LQR, Li and Todorov 2004) by Riccati's recursion. It simulates several
+step lengths and takes the best. If none lowers the cost, it raises the damping of the Hessian of the controls.
 """
 
 from collections.abc import Callable
@@ -36,21 +35,21 @@ from dln_jax.types import InputError, require_positive
 
 STEP_LENGTHS = (1.0, 0.3)
 BARRIER = 1e-3
-"""Default μ, in units of the cost: a control whose limit is worth p per unit stays μ / p away from it."""
+"""Default μ, in units of the cost: a control stays μ / p away from a limit with multiplier p per unit."""
 PRICES = 1e3, 1e3
 """Prices (w_1, w_2) of the constraints of problems without `soft`."""
 MIN_DAMPING, MAX_DAMPING = 1e-9, 1e9
 TO_BOUNDARY, CLOSEST, REACH = 0.99, 1e-5, 0.1
-"""Share of the distance to a limit that a control may go in an iteration, its least distance from finite limits
-relative to their range, and D relative to the range, or to one where there is none."""
+"""Largest share of the distance to a limit in an iteration, least distance from finite limits relative to their range,
+and D relative to the range (or to 1 without a range)."""
 ROUNDING = 1e-12
 """Relative difference of costs that counts as rounding."""
 VIOLATED = 5.0
-"""Excess in units of δ that counts as a violation: the multiplier is then above nine tenths of the price."""
+"""Excess in units of δ that counts as a violation; the multiplier then exceeds nine tenths of the price."""
 
 
 def feedback(problem: TrajectoryProblem, plan: Plan, x: Any) -> Array:
-    """Returns the control [m] of the plan at a measured state [n] near its first; NaN if the state is not finite."""
+    """Returns the control [m] of the plan at a measured state [n] near its first state; NaN for a non-finite state."""
     return where_finite(_limited(problem)(plan.u[0] + plan.K[0] @ (x - plan.x[0]), plan.u[0]), jnp.asarray(x, float))
 
 
@@ -62,9 +61,8 @@ def prepare(
 
     Args:
         problem: over the horizon; its knots, if any, have N+2 rows, from this sample to the end of the next horizon.
-        plan: the plan that gave the control.
-        x: measured state. Components that are not finite are replaced by those that the plan expects, and the plan's
-            `ending` is `NOT_FINITE`.
+        plan: the plan used by `feedback`.
+        x: measured state. The plan's prediction replaces non-finite components, and `ending` is then `NOT_FINITE`.
         barrier, step_lengths: as for `improve`.
         iterations: number of iterations; it may be traced.
 
@@ -84,7 +82,7 @@ def prepare(
         return followed(now, x, (about, plan.u, jnp.zeros_like(plan.u), K), _limited(problem))
 
     states, u = under(plan.x[:-1], plan.K)
-    # Gains that are too large for the deviation, as after a blow, would make every later plan NaN.
+    # Gains too large for the deviation, for example after an impact, would make every later plan NaN.
     lost = ~jnp.isfinite(states).all()
     bare = lambda: under(jnp.zeros_like(plan.x[:-1]), jnp.zeros_like(plan.K))  # noqa: E731
     states, u = jax.lax.cond(lost, bare, lambda: (states, u))
@@ -105,7 +103,8 @@ def prepare(
 def mpc(
     problem: TrajectoryProblem, *, barrier: Any = BARRIER, iterations: int = 1, step_lengths: Any = STEP_LENGTHS
 ) -> Callable[..., tuple[Array, Plan]]:
-    """Model predictive control: (state, plan) -> (control, plan of the next sample), by `feedback`, then `prepare`.
+    """Returns (state, plan) -> (control, plan of the next sample): model predictive control by `feedback` and
+    `prepare`.
 
     Start with a plan of `shoot` or `first_plan`, after a few calls of `improve`. If the problem has knots,
     pass them as a third argument, N+2 rows from the present sample on.
@@ -127,17 +126,17 @@ def mpc(
 def improve(
     problem: TrajectoryProblem, plan: Plan, *, barrier: Any = BARRIER, step_lengths: Any = STEP_LENGTHS
 ) -> Plan:
-    """Runs one iteration from the plan's first state; the cost with barriers and prices rises by rounding at most.
+    """Runs one iteration from the plan's first state; the cost with barriers and prices never rises beyond rounding.
 
-    All constraints except the limits of the controls have the prices `soft` of the problem, or 1e3; limits of the
-    states too. The plan's `ending` is `VIOLATED` if the plan violates a constraint (`worst_violation` says which),
-    `NOT_FINITE` if its cost is not finite, and otherwise undecided.
+    All constraints except the limits of the controls have the prices `soft` of the problem, by default 1e3. The plan's
+    `ending` is `VIOLATED` if the plan violates a constraint (`worst_violation` names it), `NOT_FINITE` if its cost is
+    not finite, and otherwise undecided.
 
     Args:
         problem: over the horizon.
         plan: such as a result of `shoot` or `first_plan`.
         barrier: μ, in units of the cost; it may be traced, to fall from iteration to iteration.
-        step_lengths: step lengths [L] that an iteration tries.
+        step_lengths: step lengths [L] to try in an iteration.
 
     Raises:
         InputError: a component of the first state is free, or the barrier is not positive.
@@ -145,7 +144,7 @@ def improve(
     if not isinstance(barrier, Tracer):
         require_positive(barrier=barrier)
     if problem.free is not None:
-        raise InputError("a component of the first state is free, but in real time it is measured; leave `free` out")
+        raise InputError("the first state has a free component, but it is measured in real time; leave out `free`")
     n, m = plan.x.shape[1], plan.u.shape[1]
     at_step, at_end = _smooth(problem, n, m, barrier)
     (knots, last), limited = knots_of(problem), _limited(problem)
@@ -175,7 +174,8 @@ def improve(
     states, controls, (costs, excesses) = jax.vmap(trial)(jnp.asarray(step_lengths, u.dtype))
     costs, (now, excess) = jnp.where(jnp.isfinite(costs), costs, jnp.inf), total(plan.x, u)
     best = jnp.argmin(costs)
-    # Equal within rounding counts as better: at the optimum the damping must not grow, nor the gains vanish.
+    # A cost equal within rounding counts as better: at the optimum the damping must not grow, and the gains must not
+    # vanish.
     better = (costs[best] <= now + ROUNDING * jnp.abs(now)) | (jnp.isfinite(costs[best]) & ~jnp.isfinite(now))
     x, u, cost, excess = (
         jnp.where(better, new[best], old)
@@ -264,7 +264,8 @@ def _smooth(problem: TrajectoryProblem, n: int, m: int, barrier: Any) -> tuple[_
 
 
 def _limits(lower: Any, upper: Any, size: int) -> tuple[np.ndarray, Array, Array]:
-    """Returns signs [r, size], bounds [r] and D [r] of finite limits, signs y <= bounds; traced limits are finite."""
+    """Returns signs [r, size], bounds [r] and D [r] of finite limits, signs y <= bounds; traced limits count as
+    finite."""
     sides = []
     for sign, limit in ((-1.0, lower), (1.0, upper)):
         known = np.ones(size, bool) if isinstance(limit, Tracer) else np.isfinite(np.broadcast_to(limit, size))
@@ -281,7 +282,7 @@ def _range(lower: Any, upper: Any) -> Array:
 
 
 def _limited(problem: TrajectoryProblem) -> Callable[[Array, Array], Array]:
-    """Returns (control, previous control) -> control within its limits and at most `TO_BOUNDARY` of the way to them."""
+    """Returns (control, previous control) -> control within its limits, at most `TO_BOUNDARY` of the way to them."""
     lower, upper = (jnp.asarray(limit, float) for limit in (problem.lower, problem.upper))
     closest = CLOSEST * _range(lower, upper)
 
@@ -293,5 +294,5 @@ def _limited(problem: TrajectoryProblem) -> Callable[[Array, Array], Array]:
 
 
 def _width(problem: TrajectoryProblem, barrier: Any) -> Any:
-    """Returns δ, the width over which a price rises."""
+    """Returns δ, the width of the smooth rise of a price."""
     return 2 * barrier / (PRICES if problem.soft is None else problem.soft)[0]

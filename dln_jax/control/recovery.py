@@ -1,9 +1,9 @@
 """Repeated plans: recovery from any state, such as after a push, by predictive control that plans again on the way.
 
-Where the regulator's cost to go is below a level, the regulator acts and nothing is planned. Elsewhere,
-`real_time.prepare` improves a set of plans in every step of the horizon, and the cheapest plan acts: its control and
-its gains, about the states that it expects within the step. When the state leaves the region, all plans restart from
-there with the controls of their first guesses; a plan that is not finite restarts in any step.
+Where the cost to go of the regulator is below a level, the regulator acts and nothing is planned. Elsewhere,
+`real_time.prepare` improves a set of plans in every step of the horizon. The cheapest plan acts, with its control and
+its gains about the predicted states. When the state leaves the region, all plans restart there with the controls of
+their first guesses. A non-finite plan restarts in any step.
 """
 
 from collections.abc import Callable
@@ -23,16 +23,16 @@ from dln_jax.types import require_positive
 LENGTHS = (1.0, 0.5, 0.25, 0.125, 0.0625)
 """Step lengths of an iteration."""
 DAMPING = (1e-5, 10.0)
-"""Range of the damping before an iteration: a plan that moves with the plant cannot wait for a smaller one to grow."""
+"""Range of the damping before an iteration. In real time there are too few iterations to let a smaller damping grow."""
 RENEWING = 5
-"""Iterations on plans that restart when the state leaves the regulator's region."""
+"""Iterations on restarted plans when the state leaves the region of the regulator."""
 
 
 class Recovery(NamedTuple):
     """Memory of a controller by repeated plans."""
 
     near: Bool[Array, ""]
-    """Whether the regulator acts."""
+    """True while the regulator acts."""
     plans: Plan
     """Plans for the next step, along a leading axis."""
     acting: tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " n"], Float[Array, " n"]]
@@ -61,8 +61,8 @@ def recovery_by_plans(
         level: the regulator acts while the cost to go is below it.
         rate: sampling rate, Hz.
         every: samples per step.
-        parameters: tree of arrays in the memory, which another controller changes on the way; by default none. If
-            given, `problem` is a function of them, and `near` and `cost` take them as last argument.
+        parameters: tree of arrays in the memory that another controller may change; by default none. `problem` is then
+            a function of them, and `near` and `cost` take them as last argument.
 
     Raises:
         InputError: a number is not positive, or `improve` refuses the problem.
@@ -77,8 +77,8 @@ def recovery_by_plans(
         chosen = jax.vmap(lambda again, *pair: jax.tree.map(lambda new, old: jnp.where(again, new, old), *pair))
         started = chosen(again, fresh, going)
         controls = jax.vmap(lambda plan: feedback(now, plan, x))(started)
-        # A number instead of a condition: under `vmap`, where lanes near the goal plan too, it is one for all lanes
-        # unless one of them has just left the goal.
+        # A number of iterations instead of a condition: under `vmap`, it is one for all lanes, unless a lane has just
+        # left the goal.
         turns = jnp.where(memory.near & ~within, RENEWING, 1)
         after = jax.vmap(lambda plan: prepare(now, plan, x, iterations=turns, step_lengths=LENGTHS))(started)
         best = jnp.argmin(jnp.where(jnp.isfinite(after.cost), after.cost, jnp.inf))
@@ -90,11 +90,12 @@ def recovery_by_plans(
         now = problem if memory.parameters is None else problem(memory.parameters)
         seen = jnp.isfinite(x).all()
         within = jnp.where(seen, cost(x, *last) <= level, memory.near)
-        # Plans go on from the state that they expect.
+        # Plans continue from their predicted state.
         known = jnp.where(seen, x, memory.acting[3])
-        # Counted by time, which all lanes of a `vmap` share: with a counter in memory they would plan at every sample.
+        # The time counts the steps, because all lanes of a `vmap` share it; with a counter in memory they would plan at
+        # every sample.
         number = jnp.round(t * rate).astype(int) % every
-        # The regulator takes over at any sample, a plan only at the start of a step.
+        # The regulator takes over at any sample, but a plan only at the start of a step.
         kept = lambda memory, x, within: memory  # noqa: E731
         if_away = lambda *args: jax.lax.cond(within, kept, planned, *args)  # noqa: E731
         memory = jax.lax.cond(number == 0, if_away, kept, memory, known, within)

@@ -2,8 +2,8 @@
 
     J = integral (x - x0)ᵀ Q (x - x0) + (u - u0)ᵀ R (u - u0) dt,   u = u0 - K (x - x0),   J(x) = (x - x0)ᵀ S (x - x0)
 
-SciPy (imported on use) solves the Riccati equations of constant matrices; the backward recursion along a trajectory is
-differentiable. Errors of angles are wrapped.
+SciPy (imported on use) solves the Riccati equations for constant matrices. The backward recursion along a trajectory is
+differentiable. Angle errors are wrapped.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ class Regulator(NamedTuple):
 
 
 class Region(NamedTuple):
-    """Region around a goal where a regulator's cost to go is at most a level."""
+    """Region around a goal with a cost to go of at most a level."""
 
     level: float
     """Level of (x - x0)ᵀ S (x - x0)."""
@@ -135,8 +135,8 @@ def value(regulator: Regulator, goal: Any, joints: tuple[JointKind, ...]) -> Cal
 
 
 def switched(far: Law, near: Law, cost: Callable[[Array], Scalar], level: Any) -> Law:
-    """Returns the law that is `near` where the cost to go is at most the level, and `far` elsewhere."""
-    # Both are evaluated, and the one that does not apply may be NaN.
+    """Returns the law `near` where the cost to go is at most the level, and `far` elsewhere."""
+    # Both laws are evaluated; the inactive one may be NaN.
     return lambda x: where_finite(jnp.where(cost(x) <= level, near(x), far(x)), x)
 
 
@@ -155,7 +155,7 @@ def region_of_attraction(
     starts: int = 64,
     key: Array | None = None,
 ) -> Region:
-    """Returns the largest level up to which all random starts on the level's surface reach the goal in simulation.
+    """Returns the largest level with only successful simulations from random starts on its surface and below it.
 
     Args:
         field: (x, u) -> dx/dt of the plant.
@@ -214,24 +214,24 @@ def _checked(A: Any, B: Any, Q: Any, R: Any) -> tuple[np.ndarray, ...]:
     for name, matrix, kind, lower in (("Q", Q, "semi-definite", -NEGLIGIBLE), ("R", R, "definite", 0.0)):
         sizes = np.linalg.eigvalsh(matrix)
         if not np.allclose(matrix, matrix.T) or sizes.min() <= lower * max(abs(matrix).max(), 1e-300):
-            raise InputError(f"{name} is not symmetric and positive {kind}; expected a cost that is")
+            raise InputError(f"{name} is not symmetric and positive {kind}; expected a convex cost")
     return A, B, Q, R
 
 
 def _regulator(A: np.ndarray, B: np.ndarray, solve: Any, gain: Any, *, decay: Any) -> Regulator:
     """Returns the regulator from the solution of a Riccati equation, if all eigenvalues of the closed loop decay.
 
-    The Hautus test comes first: [A - s I, B] has full rank at every eigenvalue s that does not decay by itself.
+    The Hautus test comes first: [A - s I, B] must have full rank at every eigenvalue s that does not decay.
     """
     values, size = np.linalg.eigvals(A), max(np.linalg.norm(A), np.linalg.norm(B), 1e-300)
     for value in values[decay(values) <= NEGLIGIBLE]:
         sizes = np.linalg.svd(np.hstack([A - value * np.eye(len(A)), B]), compute_uv=False)
         if sizes[-1] <= 1e-9 * size:
             raise InputError(
-                f"the linearisation is not controllable: its mode of eigenvalue {value:.3g} does not decay, and no "
-                "control reaches it; choose another equilibrium, or another motor"
+                f"the linearisation is not controllable: the mode with eigenvalue {value:.3g} does not decay, and "
+                "no control affects it; choose another equilibrium, or another motor"
             )
-    expected = "expected costs that see every unstable mode"
+    expected = "every unstable mode must have a cost"
     try:
         S = solve()
     except (np.linalg.LinAlgError, ValueError) as error:

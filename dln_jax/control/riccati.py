@@ -4,7 +4,7 @@
 
 The components of dx_0 are zero, or free where stated. The recursion factorises the matrix of the Karush-Kuhn-Tucker
 conditions stage by stage (Rao, Wright and Rawlings 1998). All its pivots are positive if and only if the program has a
-unique minimum, which is the inertia test of an interior-point method.
+unique minimum: the inertia test of interior-point methods.
 """
 
 from typing import Any, NamedTuple
@@ -38,7 +38,7 @@ class HorizonSolution(NamedTuple):
     multipliers: Float[Array, "N n"]
     """Derivative of the cost to go by dx_{k+1}."""
     convex: Bool[Array, ""]
-    """Whether the program has a unique minimum."""
+    """True if the program has a unique minimum."""
 
 
 def least_cost(horizon: Horizon, free: Any = None) -> HorizonSolution:
@@ -77,7 +77,7 @@ def least_cost(horizon: Horizon, free: Any = None) -> HorizonSolution:
 def eliminated(n: int, q: Array, Q: Array) -> tuple[Array, Array, tuple[Array, Array], Array]:
     """Eliminates the controls from q·(dx, du) + ½ (dx, du)ᵀ Q (dx, du), with n states.
 
-    Returns k and K of du = k + K dx, gradient and curvature of the rest, and whether the minimum is unique.
+    Returns k and K of du = k + K dx, gradient and curvature by dx, and whether the minimum is unique.
     """
     both, definite = _definite_solve(Q[n:, n:], jnp.concatenate([q[n:, None], Q[n:, :n]], axis=1))
     k, K = -both[:, 0], -both[:, 1:]
@@ -86,7 +86,8 @@ def eliminated(n: int, q: Array, Q: Array) -> tuple[Array, Array, tuple[Array, A
 
 
 def made_convex(R: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Returns R, plus enough of the identity (by Gershgorin's discs) if R is not positive definite; |R| if m = 1."""
+    """Returns R, plus a multiple of the identity (from Gershgorin's discs) if R is not positive definite; |R| if m =
+    1."""
     if len(R) == 1:
         return jnp.abs(R)
     diagonal = jnp.diagonal(R)

@@ -3,10 +3,10 @@
     min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   c <= 0,   h(x_N) = 0
 
 Multiple shooting takes the states at all knots as unknowns. The defect of a step, f(x_k, u_k) - x_{k+1}, vanishes only
-at the solution: a guess need not be a motion, and an unstable system does not multiply its errors over the horizon
-(Bock and Plitt 1984). Single shooting moves the controls alone: each trial is a motion under the gains of the step, so
-it cannot get stuck between states that no motion joins. Both use the full curvature, including that of the steps.
-Implicit steps made by `integrated` are differentiated by the implicit function theorem.
+at the solution: a guess need not be a motion, and an unstable system does not amplify its errors over the horizon (Bock
+and Plitt 1984). Single shooting changes the controls alone: each trial is a motion under the gains of the step, so it
+cannot get stuck between states that no motion joins. Both methods use the full curvature, including the curvature of
+the steps. Implicit steps from `integrated` are differentiated by the implicit function theorem.
 """
 
 from typing import Any, Literal, NamedTuple
@@ -36,7 +36,7 @@ class Shooting(NamedTuple):
     """Result of `shoot`."""
 
     plan: Plan
-    """Plan for `mpc` and for feedback along it; its states are those at the knots, a motion to within the defect."""
+    """Plan for `mpc` and for feedback along it; its states at the knots form a motion to within the defect."""
     multipliers: Float[Array, "N n"]
     """Derivatives of the cost to go by the states at the ends of the steps."""
     end_multipliers: Float[Array, " q"]
@@ -61,19 +61,20 @@ class Shooting(NamedTuple):
     ending: Int[Array, ""]
     """An `Ending`."""
     single: Bool[Array, ""]
-    """Whether the plan is that of single shooting."""
+    """True if single shooting found the plan."""
 
     @property
     def converged(self) -> Bool[Array, ""]:
-        """Whether all conditions of an optimum hold within the tolerance, and all constraints within 100 times it.
+        """True if all optimality conditions hold within the tolerance, and all constraints within 100 times the
+        tolerance.
 
-        `verdict` says why not.
+        Otherwise `verdict` gives the reason.
         """
         return self.ending == Ending.CONVERGED
 
     @property
     def verdict(self) -> str:
-        """Which method gave the plan, and how its search ended."""
+        """Sentence with the method that found the plan and the end of its search."""
         return f"{'single' if self.single else 'multiple'} shooting {reason(self.ending)}"
 
 
@@ -91,27 +92,27 @@ def shoot(
 ) -> Shooting:
     """Returns a locally optimal trajectory near a guess; traceable.
 
-    The search leaves saddles. If it gives up where hard constraints are violated, another search restores them or shows
-    that the problem is locally infeasible (see `control.phases`). The plan of `Ending.INFEASIBLE` has the least
-    violation nearby; its residuals and multipliers are those of the sum of violations.
+    The search leaves saddles. If it gives up with violated hard constraints, another search restores them or shows that
+    the problem is locally infeasible (see `control.phases`). A plan with `Ending.INFEASIBLE` has the least violation
+    nearby; its residuals and multipliers belong to the sum of violations.
 
     Args:
         problem: problem to solve.
         x: initial state [n].
         states: guess [N+1, n], which need not be a motion; x replaces its first state, except for free components.
-            `None` for the motion under u, with which single shooting starts in any case.
+            `None` for the motion under u; single shooting always starts with it.
         u: guess [N, m].
-        method: by default multiple shooting, and single shooting from the same controls if that fails. The plan is then
-            that of single shooting if it converged.
-        iterations: largest number of iterations of a search; leaving a saddle and restoring constraints are separate
+        method: by default multiple shooting, and if it fails, single shooting from the same controls. The plan then
+            comes from single shooting if that converged.
+        iterations: largest number of iterations per search. Leaving a saddle and restoring constraints are separate
             searches.
         tolerance: tolerance of stationarity, feasibility and complementarity, with the cost scaled so that its
             derivatives at the guess are at most 100. Stationarity and complementarity are divided by a hundredth of the
-            mean multiplier if that is above one.
-        exact: whether to use the curvature of the steps and constraints; otherwise the method is Gauss-Newton, which
-            does not recognise saddles.
-        starts: more guesses, states [G, N+1, n] or `None`, and u [G, N, m]. All run as one program, and the best is
-            kept: that of least objective within the hard constraints, or else of least violation.
+            mean multiplier if this exceeds one.
+        exact: use the curvature of the steps and constraints. Otherwise the method is Gauss-Newton, which does not
+            recognise saddles.
+        starts: more guesses, states [G, N+1, n] or `None`, and u [G, N, m]. All run as one program. The best has the
+            least objective within the hard constraints, or otherwise the least violation.
 
     Raises:
         InputError: shapes do not agree, a setting is not positive, limits are crossed, the start violates the limits of
@@ -119,7 +120,7 @@ def shoot(
     """
     require_positive(iterations=iterations, tolerance=tolerance)
     if method not in (None, "multiple", "single"):
-        raise InputError(f"method is {method!r}; expected 'multiple', 'single', or None for one after the other")
+        raise InputError(f"method is {method!r}; expected 'multiple', 'single', or None for both in turn")
     start, x, u = x, jnp.asarray(x, float), jnp.asarray(u, float)
     states = None if states is None or method == "single" else jnp.asarray(states, float)
     if x.ndim != 1 or u.ndim != 2 or not len(u) or (states is not None and states.shape != (len(u) + 1, len(x))):
@@ -145,7 +146,7 @@ def shoot(
         if starts is None:
             return one(single, *guesses)
         plans = jax.vmap(lambda *guess: one(single, *guess))(*guesses)
-        # Least objective, or least violation if all violate hard constraints.
+        # The least objective, or the least violation if all violate hard constraints.
         keys = plans.objective, jnp.maximum(plans.violation, plans.feasibility)
         objective, off = (jnp.where(jnp.isfinite(key), key, jnp.inf) for key in keys)
         chosen = jnp.where(jnp.isfinite(objective).any(), jnp.argmin(objective), jnp.argmin(off))
@@ -233,12 +234,12 @@ def _solved(
 
 
 def _with_first(states: Any, u: Array, more_states: Any, more_u: Any) -> tuple[Any, Array]:
-    """Stacks a guess and further guesses; without states, those of the others do not count."""
+    """Stacks a guess and further guesses; without states, the states of the others are ignored."""
 
     def both(one: Array, others: Any) -> Array:
         others = jnp.asarray(others, float)
         if others.shape[1:] != one.shape:
-            raise InputError(f"starts have shape {others.shape}; expected {one.shape} behind an axis of guesses")
+            raise InputError(f"starts have shape {others.shape}; expected {one.shape} with a leading axis of guesses")
         return jnp.concatenate([one[None], others])
 
     return None if states is None else both(states, more_states), both(u, more_u)

@@ -1,6 +1,6 @@
 """Mechanical systems in state space, x = (q, qd): field, steps, linearisation, and errors of angles.
 
-A control law returns NaN for a state that is not finite (`where_finite`), even after limiting (`saturated`).
+A control law returns NaN for a non-finite state (`where_finite`), also after limiting (`saturated`).
 """
 
 from collections.abc import Callable
@@ -76,7 +76,7 @@ def linearise(field: Field, x: Any, u: Any, *, tolerance: float = 1e-6) -> Linea
     Args:
         field: (x, u) -> dx/dt.
         x: state [n] at rest.
-        u: controls [m] that hold it.
+        u: controls [m] that hold the state.
         tolerance: largest |dx/dt| at (x, u), in the units of the field.
 
     Raises:
@@ -114,7 +114,7 @@ def holding_controls(plant: Dynamics, q: Any, actuation: Any = None, *, toleranc
     left = float(jnp.max(jnp.abs(B @ u - weight)))
     if not left <= tolerance:
         raise InputError(
-            f"no controls hold the posture: {left:.3g} N m or N is left over at a coordinate without a motor; "
+            f"no controls hold the posture: {left:.3g} N m or N remains at a coordinate without a motor; "
             "give an equilibrium"
         )
     return u
@@ -123,7 +123,7 @@ def holding_controls(plant: Dynamics, q: Any, actuation: Any = None, *, toleranc
 def where_finite(u: Array, *state: Any) -> Array:
     """Returns the controls [m] for a finite state, and NaN for every motor otherwise, so that the caller can react.
 
-    Without it, a law that uses only some coordinates would return numbers while others are NaN.
+    Otherwise a law of some coordinates would return numbers while other coordinates are NaN.
     """
     finite = jnp.asarray(True)
     for part in state:
@@ -132,13 +132,13 @@ def where_finite(u: Array, *state: Any) -> Array:
 
 
 def saturated(u: Any, lower: Any, upper: Any) -> Array:
-    """Clips controls to their limits; one that is not finite becomes NaN, so that the caller can react."""
+    """Clips controls to their limits; a non-finite control becomes NaN, so that the caller can react."""
     u = jnp.asarray(u)
     return jnp.where(jnp.isfinite(u), jnp.clip(u, lower, upper), jnp.nan)
 
 
 def circular(joints: tuple[JointKind, ...], n: int) -> Bool[np.ndarray, " n"]:
-    """Returns the mask of the angles on a circle among n states, the first of which are these joints."""
+    """Returns the mask [n] of the angles on a circle; the first states are these joints."""
     return np.array([number < len(joints) and joints[number] == "revolute" for number in range(n)])
 
 

@@ -1,10 +1,10 @@
 """Swing-ups by energy, from a known or learned model, with gains and costs from the model's natural scales.
 
-1. The model's friction is removed: the rest has an energy and a smooth linearisation.
-2. The model's own equilibrium near the goal is computed, because a learned potential is not level exactly at the goal.
-3. Far from it the energy law acts, near it the regulator of the linearisation; the regulator's cost to go decides.
+1. The model's friction is removed; the remaining system has an energy and a smooth linearisation.
+2. The model's own equilibrium near the goal is computed, because a learned potential is not exactly level at the goal.
+3. Far from it the energy law acts; near it the regulator of the linearisation acts. The regulator's cost to go decides.
 4. A share of the friction of the active joints is compensated, at the measured rates.
-5. At rest the energy law returns zero and dry friction would hold the plant, so a kick starts it.
+5. At rest the energy law returns zero, and dry friction would hold the plant. A kick starts it.
 
 With the active joints locked at the goal, the passive part falls from the goal at a rate lambda. It needs the energy E
 from its lowest to its highest posture, and swings at the speed w = √(2 E / M_pp) at most. Motors at their limits
@@ -13,10 +13,10 @@ accelerate the active joints by a. Then
     k_energy = energy · a / (E |M_ap| w),   k_p = (stiffness · lambda)²,   k_d = 2 damping · stiffness · lambda
     Q = diag(1 / s², (rates / (s lambda))²),   R = effort / u²,   level = (catch · u)² / max(K S⁻¹ Kᵀ)
 
-with the limits u of the controls (in `level`, what holding the goal leaves of them), and errors s of equal cost:
-`PASSIVE` for passive angles, `reach` for an active angle in rad, and for a rail `reach` times g / lambda² or half the
-rail, whichever is shorter. On the surface of the catch region the regulator asks for at most `catch` times what the
-motors have to spare. The energy law aims `surplus` E above the goal, because friction takes energy away on the way up.
+with the limits u of the controls (in `level`, minus the holding controls), and errors s of equal cost: `PASSIVE` for
+passive angles, `reach` for an active angle in rad, and for a rail `reach` times the smaller of g / lambda² and half the
+rail. On the surface of the catch region the regulator uses at most the share `catch` of the motors' reserve. The energy
+law aims `surplus` E above the goal, because friction takes energy on the way up.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,7 +41,7 @@ FARTHEST = 0.1
 LEVEL = 1e-6
 """Largest remaining torque at the equilibrium, N m or N."""
 STILL = 0.05
-"""Largest measured rate that counts as rest, 1/s or m/s."""
+"""Largest measured rate at rest, 1/s or m/s."""
 PASSIVE = 0.2
 """Error of a passive angle in Q, rad."""
 CIRCLE = 65
@@ -57,7 +57,7 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "kick": (0.3, 1.0),
     "surplus": (0.01, 0.5),
 }
-"""Range of every number; draws are uniform in its logarithm."""
+"""Range of every number; draws are uniform in the logarithm."""
 USUAL = {name: float(np.sqrt(low * high)) for name, (low, high) in RANGES.items()}
 SMOOTHING = 0.05
 """Smoothing of the friction compensation, as a share of lambda times the size of a coordinate."""
@@ -84,7 +84,7 @@ class Upright(NamedTuple):
     """A checked model of a plant with its own equilibrium near the goal, and its scales."""
 
     model: Dynamics
-    """With friction, if it has any."""
+    """The model with its friction."""
     layout: Layout
     parts: Parts
     at: Linearisation
@@ -102,7 +102,7 @@ class Upright(NamedTuple):
         return np.concatenate([self.layout.hanging, np.zeros(len(self.layout.joints))])
 
     def controls(self, forces: Array) -> Array:
-        """The controls [m] of forces of the active joints: motors are ordered by columns of the actuation."""
+        """Returns the controls [m] for forces of the active joints, in the order of the motors."""
         return jnp.asarray(np.linalg.pinv(self.layout.actuation[np.array(self.parts.active)])) @ forces
 
 
@@ -120,14 +120,14 @@ class SwingUpNumbers(NamedTuple):
     kick: Any
     """Kick in N m or N on a plant at rest far from the goal, towards the active joints' goal."""
     surplus: Any
-    """Target energy above that of the goal, J, which compensates losses of the passive joints."""
+    """Target energy above the goal, J, to compensate losses of the passive joints."""
 
 
 def nearest_equilibrium(plant: Dynamics, goal: Any, passive: Sequence[int]) -> Vector:
-    """Returns the posture [d] near a goal with zero force at the passive joints, by Newton's method over these.
+    """Returns the posture [d] near a goal with zero force at the passive joints, by Newton's method.
 
     Raises:
-        InputError: there is none within `FARTHEST`.
+        InputError: there is no equilibrium within `FARTHEST`.
     """
     goal, free = jnp.asarray(goal, float), np.array(passive)
     rest = jnp.zeros_like(goal)
@@ -143,13 +143,13 @@ def nearest_equilibrium(plant: Dynamics, goal: Any, passive: Sequence[int]) -> V
     if not off <= FARTHEST:
         raise InputError(
             f"the model has no equilibrium near the goal: the nearest is {off:.3g} away, more than {FARTHEST:g} rad or "
-            "m; learn it from motions that come near the goal"
+            "m; train the model on motions near the goal"
         )
     return goal.at[free].set(angles)
 
 
 def upright_of(model: Dynamics | InverseForward, layout: Layout) -> Upright:
-    """Checks a known or learned model of a plant, computes its equilibrium near the goal, and its scales.
+    """Checks a model of a plant, and computes its equilibrium near the goal and its scales.
 
     Raises:
         InputError: the model has no energy, no definite mass matrix or no equilibrium near the goal; the limits cannot
@@ -160,19 +160,19 @@ def upright_of(model: Dynamics | InverseForward, layout: Layout) -> Upright:
     sound = np.asarray(jax.jit(jax.vmap(lambda q: definite(model, q)))(circle(layout)))
     if not sound.all():
         raise InputError(
-            f"the model's mass matrix is not positive definite in {np.mean(~sound):.1%} of the postures that a "
-            "swing-up goes through; learn a model that is by construction, such as a structured DeLaN, or use more "
+            f"the model's mass matrix is not positive definite in {np.mean(~sound):.1%} of the postures of a "
+            "swing-up; train a model with a definite mass matrix, such as a structured DeLaN, or use more "
             "motions"
         )
     conservative = without_friction(model)
-    # Compiled, because they take longer operation by operation.
+    # Compiled, because single operations would take longer.
     inverse, forward = jax.jit(conservative.inverse_dynamics), jax.jit(conservative.forward_dynamics)
     whole = conservative._replace(inverse_dynamics=inverse, forward_dynamics=forward)
     home = nearest_equilibrium(whole, layout.goal, parts.passive)
     controls = holding_controls(whole, home, layout.actuation, tolerance=LEVEL)
     if not bool(jnp.all((controls > lower) & (controls < upper))):
         raise InputError(
-            f"the limits {lower} to {upper} do not hold the goal, which takes {np.round(controls, 4).tolist()}; "
+            f"holding the goal takes {np.round(controls, 4).tolist()}, outside the limits {lower} to {upper}; "
             "choose another goal, or a stronger motor"
         )
     x = jnp.concatenate([home, jnp.zeros_like(home)])
@@ -181,7 +181,7 @@ def upright_of(model: Dynamics | InverseForward, layout: Layout) -> Upright:
 
 
 def circle(layout: Layout) -> np.ndarray:
-    """Returns postures [n, d] in which the passive joints turn together, with the active at the goal or hanging."""
+    """Returns postures [n, d] with the passive joints turned together and the active joints at the goal or hanging."""
     angle = np.linspace(-np.pi, np.pi, CIRCLE)[:, None]
     passive = 1.0 - (layout.actuation != 0).any(axis=1)
     rest = np.where(passive > 0, layout.goal, layout.hanging)
@@ -200,7 +200,7 @@ def _scales(model: Dynamics, layout: Layout, parts: Parts, home: Array) -> Scale
     energies = jax.jit(jax.vmap(lambda q: passive_energy(model, parts, home)(q, rest)))(circle(layout))
     energy = -float(np.min(energies))
     if not (fall > 0 and energy > 0):
-        raise InputError("the passive joints do not fall from the goal; expected a goal where they stand upright")
+        raise InputError("the passive joints do not fall from the goal; expected an upright goal")
     largest = np.abs(layout.limits.control).min(axis=1)
     mobility = np.linalg.solve(M, layout.actuation)[active]
     acceleration = float(np.min(np.abs(np.diag(mobility)) * largest))
@@ -213,7 +213,7 @@ def _scales(model: Dynamics, layout: Layout, parts: Parts, home: Array) -> Scale
 
 
 def swing_up_numbers(upright: Upright, numbers: Mapping[str, float]) -> SwingUpNumbers:
-    """Returns the settings of a swing-up from numbers without units, and perhaps "total"; raises as `lqr`."""
+    """Returns the settings of a swing-up from dimensionless numbers, optionally with "total"; raises as `lqr`."""
     active, passive = map(np.array, upright.parts)
     scales, largest = upright.scales, upright.forces
     size = np.copy(scales.sizes)
@@ -253,7 +253,7 @@ def law_of(upright: Upright, numbers: SwingUpNumbers) -> Law:
 
 
 def friction_of(upright: Upright) -> Law:
-    """Returns x -> controls that compensate most of the friction of the active joints; zero for a model without."""
+    """Returns x -> controls that compensate most of the friction of the active joints; zero without friction."""
     active, scales = np.array(upright.parts.active), upright.scales
     with jax.ensure_compile_time_eval():  # also while a law is traced
         moving = jnp.ones(len(upright.layout.joints))

@@ -1,4 +1,4 @@
-"""Tracking laws for mechanical systems, compensation of friction, and the check of a model before it is used.
+"""Tracking laws for mechanical systems, friction compensation, and a check of a model before its use.
 
 Laws are functions of one state; gains and torques are differentiable.
 
@@ -7,17 +7,17 @@ Laws are functions of one state; gains and torques are differentiable.
     computed torque         tau = f(q, qd, qdd* + feedback)
 
 with f the inverse dynamics of a known or learned model, and feedback = P (q* - q) + D (qd* - qd). Computed torque
-evaluates the model at the measured state, so with a bad model it is worse than feedback alone (see `trusted`). If a
-state is not finite, all torques are NaN.
+evaluates the model at the measured state, so a bad model makes it worse than feedback alone (see `trusted`). If a state
+is not finite, all torques are NaN.
 
-Dry friction jumps when a joint reverses, where a measured rate is mostly noise. With r = √(u² + s²) > |u|, the
+Dry friction jumps when a joint reverses, and there a measured rate is mostly noise. With r = √(u² + s²) > |u|, the
 compensation of a joint at rate u is
 
     gain (w F(r) + (1 - w) F(-r)),   w = (1 + u / r) / 2
 
-This equals F(u) at rates well above the smoothing rate s. Below, it is a straight line through rest with the magnitude
-of friction at s: no jump, and no work at rest. A gain below 1 never compensates all friction, so it cannot drive a
-joint.
+This equals F(u) at rates well above the smoothing rate s. Below s, it is a straight line through zero with the
+magnitude of friction at s: no jump, and no work at rest. A gain below 1 never compensates all friction, so it cannot
+drive a joint.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,9 +36,9 @@ from dln_jax.solvers.elimination import cholesky
 from dln_jax.types import InputError, Vector, require_positive
 
 GAIN = 0.9
-"""Share of the friction that is compensated."""
+"""Default gain of the friction compensation."""
 TOLERANCE = 0.1
-"""Largest nMSE of a joint's torques: the share of their variance that a usable model may leave unexplained."""
+"""Largest nMSE of a joint's torques for a usable model: the unexplained share of their variance."""
 
 
 class Reference(NamedTuple):
@@ -68,7 +68,7 @@ def feedback(gains: Gains, q: Any, qd: Any, wanted: Reference) -> Array:
 
 
 def gravity_compensation(plant: Dynamics | InverseForward, gains: Gains) -> Tracker:
-    """Returns the law of gravity at the present posture plus feedback: exact at rest."""
+    """Returns the law: gravity at the present posture, plus feedback. Exact at rest."""
 
     def law(q: Vector, qd: Vector, wanted: Reference) -> Array:
         rest = jnp.zeros_like(qd)
@@ -78,7 +78,8 @@ def gravity_compensation(plant: Dynamics | InverseForward, gains: Gains) -> Trac
 
 
 def feed_forward(plant: Dynamics | InverseForward, gains: Gains) -> Tracker:
-    """Returns the law of the model's torque on the reference plus feedback, without the model at the measured state."""
+    """Returns the law: the model's torque on the reference, plus feedback. It never evaluates the model at the measured
+    state."""
 
     def law(q: Vector, qd: Vector, wanted: Reference) -> Array:
         planned = plant.inverse_dynamics(wanted.q, wanted.qd, wanted.qdd)
@@ -88,7 +89,7 @@ def feed_forward(plant: Dynamics | InverseForward, gains: Gains) -> Tracker:
 
 
 def computed_torque(plant: Dynamics | InverseForward, gains: Gains) -> Tracker:
-    """Returns the law of the model's torque for the reference acceleration plus feedback.
+    """Returns the law: the model's torque at the measured state for the reference acceleration plus feedback.
 
     With an exact model, and gains [d] or matrices in 1/s² and 1/s, the error obeys e'' + D e' + P e = 0.
     """
@@ -108,17 +109,17 @@ def trusted(
     out_of_distribution: Callable[[Vector, Vector, Vector], Any] | None = None,
     usable: bool = True,
 ) -> Callable[[Vector, Vector, Reference], tuple[Array, Array]]:
-    """Returns a law that uses `first` where the model is usable, with a flag, and `otherwise` elsewhere.
+    """Returns a law that applies `first` where the model is usable and `otherwise` elsewhere, with a flag.
 
-    A model is usable if its mass matrix is positive definite (by a Cholesky factor) and the state is in distribution,
-    if that can be tested. `otherwise` should not evaluate the model at the state; `feed_forward` does not.
+    A model is usable if its mass matrix is positive definite (Cholesky test) and the state is in distribution (if there
+    is a test). `otherwise` should not evaluate the model at the state; `feed_forward` does not.
 
     Args:
         plant: the model.
         first: a law such as `computed_torque`.
         otherwise: a law such as `feed_forward`.
-        out_of_distribution: (q, qd, qdd) -> whether the state is out of it, for example by a run with uncertainty.
-        usable: whether the model may be used at all, for example by `judged` on held-out motions.
+        out_of_distribution: (q, qd, qdd) -> True outside the training data, for example from a run with uncertainty.
+        usable: False disables the model, for example after `judged` on held-out motions.
     """
 
     def law(q: Vector, qd: Vector, wanted: Reference) -> tuple[Array, Array]:
@@ -157,7 +158,7 @@ def judged(plant: Dynamics, held_out: Trajectories, *, tolerance: float = TOLERA
 
     Args:
         plant: the model.
-        held_out: motions like those to be tracked, not used in the fit; joints with constant torques do not count.
+        held_out: motions like the later references, not used in the fit; joints with constant torques do not count.
         tolerance: largest nMSE of the worst joint.
     """
     require_positive(tolerance=tolerance)
@@ -167,7 +168,7 @@ def judged(plant: Dynamics, held_out: Trajectories, *, tolerance: float = TOLERA
     variance = np.var(held_out.tau, axis=0)
     moved = variance > 0
     nmse = np.mean((tau - held_out.tau) ** 2, axis=0) / np.where(moved, variance, np.nan)
-    # An error that is not finite counts as the worst.
+    # A non-finite error counts as the worst.
     worst = int(np.argmax(np.where(moved, np.where(np.isfinite(nmse), nmse, np.inf), -1.0)))
     usable = bool(nmse[worst] <= tolerance) and share == 1.0
     if share < 1:
@@ -181,9 +182,9 @@ def judged(plant: Dynamics, held_out: Trajectories, *, tolerance: float = TOLERA
 
 
 def without_friction(plant: Dynamics) -> Dynamics:
-    """Removes the friction, whose slope at rest a linearisation should not contain; the energies stay.
+    """Removes the friction and keeps the energies: a linearisation should not contain the slope of friction at rest.
 
-    Friction must add to the other forces, which holds for all systems without load-dependent friction.
+    Friction must add to the other forces, as it does without load-dependent friction.
     """
     return plant._replace(
         inverse_dynamics=lambda q, qd, qdd: plant.inverse_dynamics(q, qd, qdd) - plant.friction(q, qd),
@@ -195,13 +196,13 @@ def without_friction(plant: Dynamics) -> Dynamics:
 def friction_compensation(
     plant: Dynamics, active: Sequence[int], *, smoothing: Any, gain: float = GAIN
 ) -> Callable[[Vector, Vector], Array]:
-    """Returns (q, qd) -> forces of the active joints that compensate a share of their friction; qd measured or wanted.
+    """Returns (q, qd) -> forces that compensate a share of the active joints' friction; qd is measured or desired.
 
     Args:
-        plant: with friction, known or learned.
+        plant: known or learned model with friction.
         active: joints with a motor.
         smoothing: s, rad/s or m/s, one per active joint or one for all: a few times the noise of a measured rate.
-        gain: share of the friction, above 0 and at most 1.
+        gain: compensated share of the friction, above 0 and at most 1.
 
     Raises:
         InputError: a smoothing is not positive, or the gain is out of range.

@@ -1,4 +1,4 @@
-"""Problems of optimal trajectories with constraints, and plans as trees of arrays, so that everything is traceable.
+"""Optimal trajectory problems with constraints, and plans as traceable trees of arrays.
 
 min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   c <= 0,   h(x_N) = 0
 """
@@ -31,10 +31,10 @@ class TrajectoryProblem(NamedTuple):
     """Lower limits of the controls, [m] or one for all."""
     upper: Any = jnp.inf
     lower_x: Any = -jnp.inf
-    """Lower limits of the states x_1 to x_N, [n] or one for all; hard, like those of the controls."""
+    """Lower limits of the states x_1 to x_N, [n] or one for all; hard, like the limits of the controls."""
     upper_x: Any = jnp.inf
     path: Callable[..., Array] | None = None
-    """(x, u) -> [p], at most zero at every step, such as limits of a torque that depends on the state."""
+    """(x, u) -> [p], at most zero at every step, such as limits of a state-dependent torque."""
     states: Callable[..., Array] | None = None
     """x -> [r], at most zero at x_1 to x_N, such as negative distances to obstacles."""
     end_below: Callable[..., Array] | None = None
@@ -44,7 +44,7 @@ class TrajectoryProblem(NamedTuple):
     soft: tuple[float, float] | None = None
     """Weights (w_1, w_2) of w_1 t + w_2 t² / 2 for the excess t of `path`, `states` and `end_below`; None: hard.
 
-    The excess is zero where constraints can be met at a price per unit below w_1. Elsewhere the plan violates them and
+    The excess is zero if the constraints can be met at a price per unit below w_1. Otherwise the plan violates them and
     ends with `Ending.EXCEEDED`.
     """
     free: Any = None
@@ -57,7 +57,7 @@ class TrajectoryProblem(NamedTuple):
 
 
 def knots_of(problem: TrajectoryProblem) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """Returns the last arguments of functions at the steps, with an axis [N], and at the end; none without knots."""
+    """Returns the knot arguments of functions at the steps, with an axis [N], and at the end; empty without knots."""
     if problem.knots is None:
         return (), ()
     return (jax.tree.map(lambda rows: rows[:-1], problem.knots),), (jax.tree.map(lambda rows: rows[-1], problem.knots),)
@@ -73,13 +73,14 @@ class Plan(NamedTuple):
     cost: Float[Array, ""]
     damping: Float[Array, ""]
     better: Bool[Array, ""]
-    """Whether the last iteration found a lower cost."""
+    """True if the last iteration found a lower cost."""
     ending: Int[Array, ""]
-    """An `Ending`: the reason why the optimisation ended, undecided after a single iteration."""
+    """An `Ending`: the reason for the end of the optimisation, undecided after a single iteration."""
 
     @property
     def converged(self) -> Bool[Array, ""]:
-        """Whether the optimisation reached its tolerance; `solvers.ending.reason(plan.ending)` says why not."""
+        """True if the optimisation reached its tolerance; otherwise `solvers.ending.reason(plan.ending)` gives the
+        reason."""
         return self.ending == Ending.CONVERGED
 
 
@@ -88,7 +89,7 @@ def first_plan(problem: TrajectoryProblem, x: Any, u: Any) -> Plan:
     x, u = jnp.asarray(x, float), jnp.asarray(u, float)
     if x.ndim != 1 or u.ndim != 2 or not len(u):
         raise InputError(f"x has shape {x.shape}, u {u.shape}; expected a state [n] and controls [N, m]")
-    # Without gains, the states about which the controls are planned do not matter.
+    # Without gains, the reference states of the plan do not matter.
     about, k = jnp.tile(x, (len(u), 1)), jnp.zeros_like(u)
     u = jnp.clip(u, problem.lower, problem.upper)
     K = jnp.zeros((*u.shape, x.shape[0]), x.dtype)

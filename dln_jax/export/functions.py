@@ -1,4 +1,4 @@
-"""The functions exported from a run or a system: pure functions of one state, with example arguments.
+"""Functions to export from a run or a system: pure functions of one state, with example arguments.
 
 For a system with forces, in coordinates and velocities, x = (q, qd):
 
@@ -19,7 +19,7 @@ space, `encode` (q, p) of two images, and `decode` (frames) of q, p.
 
 NAME_jacobian returns the derivatives of all results with respect to all arguments, such as tau_q [d, d], with the
 argument's axes last. A step of x returns x_next, A and B. The derivative of a scalar is called NAME_gradient. Functions
-that a system lacks are missing.
+without meaning for a system are missing.
 """
 
 import functools
@@ -53,7 +53,7 @@ Functions = dict[str, tuple[Function, tuple[np.ndarray, ...]]]
 Named = dict[str, Function]
 """Functions of arrays that return arrays by name."""
 LARGEST_FACTOR = 250_000
-"""Largest number of entries of a covariance factor that is exported; an entry takes about 24 bytes of C."""
+"""Largest number of entries of an exported covariance factor; an entry takes about 24 bytes of C."""
 
 
 def functions_of_run(
@@ -67,15 +67,15 @@ def functions_of_run(
     """Returns the functions of a trained model, such as `load(folder)`.
 
     Args:
-        precision: f32 or f64, to which the parameters are converted; default: the precision of the training.
+        precision: f32 or f64; parameters are converted to it. Default: the precision of the training.
         names: names of the functions to return; default: all.
         iterations: as for `functions_of_system`.
-        temperature: temperature of the functions in °C, for a robot whose friction depends on it; default: the
-            reference temperature of its identification.
+        temperature: temperature in °C for a robot with temperature-dependent friction; default: the reference
+            temperature of its identification.
 
     Raises:
-        InputError: the model lacks a named function or does not depend on temperature, the precision cannot hold a
-            parameter, or a user-defined model has no needs or is exported in another precision than it was trained in.
+        InputError: the model has no such function or does not depend on temperature, a parameter is beyond the range of
+            the precision, or a user-defined model has no needs or another training precision.
     """
     description = run.description
     changes = {}
@@ -85,7 +85,7 @@ def functions_of_run(
         changes["temperature"] = float(temperature)
     if precision not in (None, description["precision"]):
         if description["name"] not in CATALOGUE:
-            raise InputError(f"a user-defined model is exported in {description['precision']}, that of its training")
+            raise InputError(f"export a user-defined model in its training precision, {description['precision']}")
         changes["precision"] = precision
     description = {**description, **changes}
     model = build(description) if changes else run.model
@@ -93,7 +93,7 @@ def functions_of_run(
 
     parameters = jax.tree.map(lambda leaf: leaf.astype(dtype), run.parameters)
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(parameters)):
-        raise InputError(f"the model has a parameter which {dtype.__name__} cannot hold; train again, or export in f64")
+        raise InputError(f"a parameter is beyond the range of {dtype.__name__}; train again, or export in f64")
     run = replace(run, model=model, description=description, parameters=parameters)
     if isinstance(model, FunctionModel):
         derivatives = model.derivatives(parameters)
@@ -109,7 +109,7 @@ def functions_of_run(
         networks |= _of_flow(images.field, iterations)
         functions = _with_examples(networks, dtype, 1, frames=(2 * description["pixels"],))
     elif (needs := description.get("needs")) is None:
-        raise InputError("the model states no needs; export functions_of_system of its energies")
+        raise InputError("the model has no needs; export functions_of_system of its energies")
     else:
         d = len(needs["joints"])
         functions = functions_of_system(
@@ -140,14 +140,14 @@ def functions_of_system(
     """Returns the functions of a known or learned system.
 
     Args:
-        system: a record of energies or of closed-form dynamics, such as the `closed_form` of a scene.
+        system: a record of energies or closed-form dynamics, such as `closed_form` of a scene.
         actuation: matrix [d, u] with tau = actuation u, for the steps; default: u is tau.
         iterations: Newton steps of the implicit midpoint rule, as for `mechanics.discrete.implicit_midpoint`.
     """
     d = degrees_of_freedom
     rest = jnp.zeros_like
     controls = d if actuation is None else np.shape(actuation)[1]
-    # Networks take long to trace; jitted, they are traced once instead of once per function that contains them.
+    # Tracing networks takes long. Jitted, they are traced once instead of once per function.
     traced = jax.tree.map(lambda leaf: jax.jit(leaf) if callable(leaf) else leaf, system)
     link = getattr(traced, "link", traced)
     functions: Named = {}
@@ -216,25 +216,25 @@ def _steps(results: Sequence[str], slopes: Sequence[str], **steps: Function) -> 
 
 
 def _named(function: Function, *results: str, like: Function | None = None) -> Function:
-    """Returns the function with its first results, named, and with the parameters of another."""
+    """Returns the function with named first results, and with the parameters of another function."""
 
     @functools.wraps(like or function)
     def call(*state):
-        # JAX sorts the keys of a plain dictionary, and keeps the order of this one.
+        # JAX sorts the keys of a plain dictionary, but keeps the order of this one.
         return OrderedDict(zip(results, jax.tree.leaves(function(*state)), strict=False))
 
     return call
 
 
 def _with_derivatives(name: str, function: Function, *results: str, slopes: Function | None = None) -> Named:
-    """Returns the function, and the derivatives of its results by its arguments, from `slopes` where it is given."""
+    """Returns the function, and the derivatives of its results by its arguments, from `slopes` if present."""
 
     def derivatives(*state):
         rows = sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(function, *state)))
         places = tuple(range(len(state)))
         if rows < sum(array.size for array in state):
             return jax.jacrev(function, argnums=places)(*state)
-        # One argument at a time: results that do not depend on it need no derivatives.
+        # One argument at a time, because results that do not depend on it need no derivatives.
         columns = [jax.tree.leaves(jax.jacfwd(function, argnums=place)(*state)) for place in places]
         return list(zip(*columns, strict=True))
 

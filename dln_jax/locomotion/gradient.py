@@ -1,22 +1,22 @@
-"""Learns to move by short-horizon gradients through the simulator, with a learned value at the end of the horizon.
+"""Learns locomotion by short-horizon gradients through the simulator, with a learned value at the horizon.
 
     command = tanh(W3 tanh(W1 body + W2 clock + b1) + b3)
     change of the actuation = 0.3 tanh((0.625 + 0.375 command - actuation) / 0.3)
 
     J(theta) = E[ sum over t < H of gamma^t r_t  +  gamma^H V(o_H) ]  under theta + s eps,    eps ~ N(0, I)
 
-The policy's layers start with variances 0.3, 1 and 0.1 over their fan-in: at first the muscles move little. Lanes come
-in pairs, +eps and -eps. Every lane walks H steps from the end of its last window, for episodes of any length. Gradients
-go back to the beginning of the window and no further, so they neither explode nor vanish over an episode; V stands for
-all later rewards (Xu et al. 2022, "Accelerated policy learning with parallel differentiable simulation"). After a fall,
-the window's later rewards and value are zero, and the lane begins a new episode with a start of its own. V is fitted to
-TD(lambda) targets, made by a copy V' that follows it slowly:
+The policy's layers start with variances 0.3, 1 and 0.1 over their fan-in, so the muscles move little at first. Lanes
+come in pairs, +eps and -eps. Every lane walks H steps from the end of its last window, for episodes of any length.
+Gradients stop at the beginning of the window, so they neither explode nor vanish over an episode. V approximates all
+later rewards (Xu et al. 2022, "Accelerated policy learning with parallel differentiable simulation"). After a fall, the
+window's later rewards and value are zero, and the lane begins a new episode from a new start. V is fitted to TD(lambda)
+targets from a slowly following copy V':
 
     G_t = r_t + gamma ((1 - lambda) V'(o_t+1) + lambda G_t+1),    G_H = V'(o_H)
 
-A lane's gradient is clipped, and left out if it is not finite. The gradient is the mean over lanes in their order, so
-it does not depend on their assignment to devices. The learning rate follows a cosine decay. The policy that is
-evaluated and kept has running averages of the parameters, because single updates throw a gait off balance and back.
+A lane's gradient is clipped, and dropped if it is not finite. The gradient is the mean over lanes in their order, so it
+does not depend on their assignment to devices. The learning rate follows a cosine decay. The evaluated policy uses
+running averages of the parameters, because single updates can unbalance a gait.
 """
 
 from collections.abc import Callable
@@ -50,7 +50,7 @@ from dln_jax.types import InputError, require_positive
 WIDTH = 64
 """Number of hidden units of the policy, and of the two hidden layers of the value."""
 LANES = "creatures side by side"
-"""Name of the items that devices share, for messages."""
+"""Name of the shared items in messages."""
 
 Parameters = Any
 
@@ -70,7 +70,7 @@ class GradientSettings(NamedTuple):
     width: int = WIDTH
     """Width of the policy's hidden layer."""
     window: int = 32
-    """H, number of steps that gradients go back."""
+    """H, number of steps in a gradient."""
     lanes: int = 4
     """Number of creatures side by side."""
     deviation: float = 0.01
@@ -80,21 +80,21 @@ class GradientSettings(NamedTuple):
     last_rate: float = 0.03
     """Last learning rate relative to the first."""
     average: float = 0.99
-    """Weight of the earlier parameters in their running average after an update."""
+    """Weight of the old average in the running average after an update."""
     value_learning_rate: float = 0.002
     """Learning rate of Adam for the value."""
     value_fits: int = 16
-    """Adam steps for the value per update, on all lanes' windows."""
+    """Adam steps for the value per update, on the windows of all lanes."""
     discount: float = 0.99
     """gamma."""
     trace: float = 0.95
     """lambda."""
     following: float = 0.2
-    """Share of the value that its copy adopts per update."""
+    """Share of the value in its copy per update."""
     updates: int = 5
-    """Updates between two evaluations by an episode from rest."""
+    """Updates between two evaluations in an episode from rest."""
     varied_updates: int = 100
-    """Updates between two evaluations by several starts, which take longer."""
+    """Updates between two evaluations from several starts, which take longer."""
 
     def updates_of(self, task: LocomotionTask) -> int:
         """Returns the number of updates between two evaluations."""
@@ -106,17 +106,17 @@ class GradientState(NamedTuple):
 
     parameters: Parameters
     averaged: Parameters
-    """Running averages of the parameters: the policy that is evaluated."""
+    """Running averages of the parameters: the evaluated policy."""
     optimiser: Any
     value: Parameters
     value_optimiser: Any
     followed: Parameters
-    """Copy of the value that makes the targets."""
+    """Copy of the value for the targets."""
     lanes: EpisodeState
     seed: Int[Array, ""]
     updates: Int[Array, ""]
     skipped: Int[Array, ""]
-    """Number of updates in which a step of the simulator did not converge."""
+    """Number of updates with a simulator step that did not converge."""
 
 
 def make_policy(task: LocomotionTask, *, width: int = WIDTH) -> Policy:
@@ -138,7 +138,7 @@ def make_policy(task: LocomotionTask, *, width: int = WIDTH) -> Policy:
 def shown_walk(
     task: LocomotionTask, policy: Policy, parameters: Parameters, steps: int, seed: int | None = None
 ) -> Walk:
-    """Runs a policy from rest, or from a start drawn by a seed, and returns its steps as NumPy arrays."""
+    """Runs a policy from rest, or from a random start of a seed, and returns its steps as NumPy arrays."""
     start = beginning(task, None if seed is None else jax.random.key(seed))
     program = jax.jit(lambda p: walk(task, lambda seen: policy.apply(p, seen), start, steps)[1])
     return jax.tree.map(np.asarray, program(parameters))
@@ -157,7 +157,7 @@ def make_updates(
     require_positive(**{**settings._asdict(), "deviation": settings.deviation or 1.0})
     shares(mesh, settings.lanes, LANES)
     if settings.lanes % 2:
-        raise InputError(f"lanes is {settings.lanes}; the gradient takes creatures in pairs: give an even number")
+        raise InputError(f"lanes is {settings.lanes}; the gradient needs pairs of creatures: choose an even number")
     lanes, window, discount = settings.lanes, settings.window, settings.discount
     clipped = optax.clip_by_global_norm(1.0)
     in_all = max(1, steps // (lanes * window))
@@ -231,7 +231,7 @@ def make_updates(
         change, moments = optimiser.update(gradient, state.optimiser, state.parameters)
         moved = optax.apply_updates(state.parameters, change)
         parameters, moments = where(finite.any(), (moved, moments), (state.parameters, state.optimiser))
-        # The first averages cover few updates, so that they forget the initial parameters.
+        # The first averages cover few updates, to forget the initial parameters.
         kept = jnp.minimum(settings.average, (1.0 + state.updates) / (10.0 + state.updates))
         averaged = optax.incremental_update(parameters, state.averaged, 1.0 - kept)
 

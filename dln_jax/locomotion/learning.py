@@ -1,9 +1,9 @@
-"""The loop that trains policies: update, evaluate, record, until a distance or a number of environment steps.
+"""Training loop for policies: update, evaluate, record, up to a distance or a number of environment steps.
 
-An environment step is one step of the simulator for one creature. After some updates the policy is evaluated by one
-episode from rest or, if the task varies, by several starts on the steepest slopes that walk for the length of several
-episodes, because falls are rare. Steps of evaluations are counted separately. The policy that is kept is the one with
-the most successful starts, and among those the one that goes farthest.
+An environment step is one step of the simulator for one creature. After some updates the policy is evaluated in one
+episode from rest. If the task varies, it is evaluated from several starts on the steepest slopes, each for several
+episodes, because falls are rare. Steps of evaluations are counted separately. The best policy has the most successful
+starts, and among equals the longest distance.
 """
 
 import math
@@ -32,9 +32,9 @@ from dln_jax.zoo import parameter_files as checkpoints
 VALIDATION = 2_000_000
 """Seed of the starts for selecting a policy; neither training nor `perturbed_trials` draws them."""
 VALIDATION_STARTS, VALIDATION_EPISODES = 16, 5
-"""Number of starts, and length of their walks in episodes."""
+"""Number of starts, and length of each walk in episodes."""
 STARTS, STEPS = 100, 2000
-"""Number of episodes, and steps of each, by which a policy is judged."""
+"""Number of episodes, and steps per episode, for judging a policy."""
 AT_ONCE = 25
 """Number of these episodes side by side."""
 SEED = 1_000_000
@@ -42,7 +42,7 @@ SEED = 1_000_000
 CHECKPOINT = "checkpoint"
 """Prefix of the checkpoint files of a seed."""
 GOAL = 5.0
-"""The effort of learning is measured up to this distance, in body lengths."""
+"""Distance, in body lengths, up to which the learning effort is measured."""
 
 
 class Record(NamedTuple):
@@ -55,9 +55,9 @@ class Record(NamedTuple):
     distance: float
     """Body lengths in one episode, before a fall: from rest, or the mean over several starts."""
     skipped: int
-    """Number of updates skipped so far because a step of the simulator did not converge."""
+    """Number of skipped updates so far, because a simulator step did not converge."""
     succeeded: float = 0.0
-    """Share of starts that end without a fall and at least a body length ahead."""
+    """Share of starts without a fall and with at least a body length of progress."""
 
 
 class Learner(NamedTuple):
@@ -104,7 +104,8 @@ def rank(record: Record | None) -> tuple[float, float]:
 
 
 def median_to_reach(seeds: Sequence[Sequence[Record]], distance: float, field: str) -> float:
-    """Median over seeds of the "steps" or "seconds" to the distance; infinite if at least half never reached it."""
+    """Returns the median over seeds of the "steps" or "seconds" to the distance; infinite if at least half never reach
+    it."""
     reached = [
         next((getattr(record, field) for record in records if record.distance >= distance), math.inf)
         for records in seeds
@@ -130,14 +131,14 @@ def train(
     Args:
         steps: environment steps of a seed; the last update may exceed them.
         until: distance in body lengths at which the training of a seed ends.
-        initial: parameters of a policy of the settings' width to train further (default: random).
-        directory: folder where states are stored.
-        resume: continue the runs stored there.
+        initial: parameters of a policy of this width to train further (default: random).
+        directory: folder for stored states.
+        resume: continue the stored runs.
         mesh: devices that share the creatures simulated side by side.
         report: called with seed and record after every evaluation.
 
     Raises:
-        InputError: settings are out of range, a stored run has others, or the mesh does not divide the creatures.
+        InputError: settings are out of range or differ from the stored run, or the mesh does not divide the creatures.
     """
     policy = make_policy(task, width=settings.width)
     if initial is not None:
@@ -158,7 +159,7 @@ def make_learner(
     steps: int,
     mesh: Mesh | None = None,
 ) -> Learner:
-    """Compiles the programs that train a policy for `steps` environment steps; errors are those of `make_updates`."""
+    """Compiles the programs that train a policy for `steps` environment steps; errors as for `make_updates`."""
     start, improve = make_updates(task, policy, settings, steps=steps, mesh=mesh)
     began = time.perf_counter()
     state = jax.eval_shape(lambda: start(0))
@@ -179,8 +180,8 @@ def make_learner(
         # A start with a step that does not converge counts 0.
         return ones * jnp.nan_to_num(results).mean(axis=0)
 
-    # Every device walks, and the first device's result counts: devices of different models may round differently, but
-    # must come to the same decisions.
+    # Every device walks, and the result of the first counts: different devices may round differently, but must make the
+    # same decisions.
     evaluate = program(lambda parameters: spread(evaluated, mesh)(parameters, jnp.ones((1, 1)))[0], mesh)
     evaluate = evaluate.lower(state.averaged).compile(quick_compilation())
     in_one = settings.updates_of(task) * settings.lanes * settings.window
@@ -203,13 +204,13 @@ def learn(
     resume: bool = False,
     report: Callable[[Record], None] = lambda record: None,
 ) -> Learned:
-    """Trains until the goal; with a directory, stores the state of every evaluation there and can resume bit for bit.
+    """Trains up to the goal. With a directory, it stores the state of every evaluation; resuming is exact.
 
     Args:
         seed: determines everything random.
         steps, until: as in `train`.
         directory: an existing folder for checkpoints.
-        settings: JSON values that determine the result; a stored run with others is not continued.
+        settings: JSON values that determine the result; a stored run with other settings is not continued.
         resume: continue the run in the directory, if it has a checkpoint.
         report: called after every evaluation.
 
@@ -218,14 +219,14 @@ def learn(
         KeyboardInterrupt: raised only after the current evaluation is stored.
     """
     if resume and directory is None:
-        raise InputError("resume needs the directory of the run; give it, or start a new run")
+        raise InputError("resume needs the directory of the run; pass it, or start a new run")
     name, identity = f"{CHECKPOINT}-{seed}", {"settings": {**(settings or {}), "seed": seed}}
     state = learner.start(seed)
     best, records = state.averaged, []
     if resume and directory is not None and has_checkpoint(directory, name):
         manifest = checkpoints.load_manifest(directory, name)
         if manifest.get("settings") != finite_values(identity["settings"]):
-            raise InputError(f"{directory}: the run was started with other settings; give those it was started with")
+            raise InputError(f"{directory}: the run has other settings; resume it with its own settings")
         rows = stored_rows(directory / f"{name}.json", manifest, "records", tuple[int, float, float | None, int, float])
         records = [Record(done, seconds, math.nan if d is None else d, *rest) for done, seconds, d, *rest in rows]
         state, best = checkpoints.load_tree(directory, name, (state, best))
@@ -260,7 +261,7 @@ class Trials(NamedTuple):
     """Gravity along x, in m/s²: positive downhill, negative uphill, 0 on level ground."""
 
     def standing(self, steps: int) -> Bool[np.ndarray, " n"]:
-        """Returns which episodes of this many steps end without a fall."""
+        """Returns the mask of episodes of this length without a fall."""
         return np.isfinite(self.distance) & (self.steps >= steps)
 
 
@@ -273,7 +274,7 @@ def perturbed_trials(
     steps: int = STEPS,
     seed: int = SEED,
 ) -> Trials:
-    """Runs episodes from starts drawn by the task's variation, on its steepest slopes."""
+    """Runs episodes from random starts of the task's variation, on its steepest slopes."""
     task = task._replace(episode=steps)
 
     def trial(parameters: Parameters, key: Array):
@@ -287,9 +288,9 @@ def perturbed_trials(
 
 
 def numbers_of(trials: Trials, steps: int = STEPS) -> dict[str, float]:
-    """Returns metrics: episodes, those without a fall, and the distance of the median and of the worst episode.
+    """Returns metrics: number of episodes, number without a fall, and median and worst distance.
 
-    On slopes also the episodes without a fall, and distances, downhill and uphill.
+    On slopes it adds the numbers without a fall and the distances downhill and uphill.
     """
     standing = trials.standing(steps)
     numbers = {"perturbed_starts": float(len(standing)), "perturbed_steps": float(steps)}

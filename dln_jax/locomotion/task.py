@@ -5,17 +5,17 @@
     reward of a step = s tanh(change of mean x / (s L)) - w posture - (1 if fallen)
     posture = 1 - cos tilt + (max(0, 0.8 - y / y_rest) / 0.2)²
 
-A policy maps the observation to the change of the muscles' actuation, which starts at 1. It sees the body in its own
-frame, so all places along the ground are equivalent. Its origin o and axes R are weighted sums of the vertices:
+A policy maps the observation to the change of the muscles' actuation, which starts at 1. It sees the body in the body's
+frame, so all places along the ground are equivalent. The origin o and axes R are weighted sums of the vertices:
 
     o = w x,    a = axes x / |axes x|,    R = rows (a, b),    b = a turned by 90 degrees          in the plane
     R = rows (a, c x a, c),    c = a x (second axis) normalised                                    in space
 
 L is the body length, u points against gravity, and h is the horizontal direction nearest to x. c is a clock, sin and
-cos of 2 pi t / P at step t; a period P of 0 leaves it out. Speeds far above s are hardly rewarded, because a creature
-that runs as fast as it can falls on downhill slopes; s = 0 rewards all speeds alike. The tilt is the angle between the
-body's up and the ground's normal, and y is the mean height. A body that has tilted by more than 1 rad has fallen, which
-ends the episode; distance after it does not count, since tall bodies would go far by rolling.
+cos of 2 pi t / P at step t; a period P of 0 leaves it out. Speeds far above s earn little, because a creature at its
+highest speed falls on downhill slopes; s = 0 rewards all speeds alike. The tilt is the angle between the body's up axis
+and the ground normal, and y is the mean height. A body tilted by more than 1 rad has fallen, which ends the episode.
+Later distance does not count, because tall bodies would go far by rolling.
 """
 
 from collections.abc import Callable
@@ -50,9 +50,9 @@ LARGEST_CHANGE = 0.3
 POSITION_UNIT = 0.1
 """Unit of observed positions, in body lengths."""
 CROUCHED = 0.8
-"""Crouching is penalised below this mean height, relative to that at rest."""
+"""Mean height, relative to rest, below which crouching is penalised."""
 FALLEN = 1.0
-"""Largest tilt of a body that has not fallen, rad."""
+"""Largest tilt of a standing body, rad."""
 CLOCK_PERIOD = 16.0
 """P in steps; 0 for no clock."""
 FALL = 1.0
@@ -100,7 +100,7 @@ class LocomotionTask(NamedTuple):
 
     @property
     def clock_size(self) -> int:
-        """Number of values at the end of an observation that show the clock."""
+        """Number of clock values at the end of an observation."""
         return 2 if self.clock_period else 0
 
     @property
@@ -135,7 +135,7 @@ class Walk(NamedTuple):
 
     @property
     def lost(self) -> Bool[Array, "*T"]:
-        """Whether the creature has fallen, or the step did not converge."""
+        """True if the creature has fallen, or the step did not converge."""
         return (self.tilt > FALLEN) | ~self.converged
 
 
@@ -155,14 +155,14 @@ def make_task(
 
     Args:
         creature: its mesh and muscles, which the policy sees.
-        scene: a scene of this mesh with your own materials, contacts and actuators: a term "gravity", whose direction
-            slopes change, and one actuator with a control per muscle (default: the published creatures' material,
-            ground and muscles).
-        dt: time step, s (default: the published one).
+        scene: a scene of this mesh with your own materials, contacts and actuators. It needs a term "gravity" (slopes
+            change its direction) and one actuator with a control per muscle. Default: the published material, ground
+            and muscles.
+        dt: time step, s (default: the published value).
 
     Raises:
-        InputError: a number is not positive, the variation is out of range, the scene is of another mesh or lacks
-            gravity, or rough ground is asked of a scene of your own.
+        InputError: a number is not positive, the variation is out of range, the scene has another mesh or no gravity,
+            or rough ground is combined with your own scene.
     """
     require_positive(episode=episode, dt=dt, clock_period=clock_period or 1.0)
     require_variation(variation)
@@ -172,8 +172,8 @@ def make_task(
         scene = creature_scene(creature, bumps)
     elif scene.mesh.vertices.shape != vertices.shape or "gravity" not in scene.params.terms or bumps is not None:
         raise InputError(
-            "the scene does not suit the task; expected the creature's mesh, a term 'gravity', and no rough ground, "
-            "which only the published ground can be"
+            "the scene does not suit the task; expected the creature's mesh and a term 'gravity' (rough ground needs "
+            "the published ground)"
         )
     frame = fitted_frame(vertices) if frame is None else frame
     stepper = make_step(scene, dt)
@@ -183,7 +183,7 @@ def make_task(
 def beginning(task: LocomotionTask, key: Array | None = None, *, steepest: bool = False) -> EpisodeState:
     """Returns the rest shape at rest on level ground or, given a key, a start perturbed by the task's variation.
 
-    With `steepest`, all slopes are the largest ones, up or down.
+    With `steepest`, all slopes are the largest, up or down.
     """
     state, world = task.stepper.init(), level_world(task.variation, task.creature.mesh.dimension)
     if key is not None:
@@ -224,9 +224,9 @@ def advance(task: LocomotionTask, place: EpisodeState, change: Float[Array, " k"
     state, info = task.stepper.step(params_of(task, place.world), start, actuation)
     travelled = (state.x[:, 0].mean() - start.x[:, 0].mean()) / task.length
     rest = jnp.asarray(task.creature.mesh.vertices, state.x.dtype)
-    # How far the body has crouched, 0 to 5.
+    # Depth of crouching, 0 to 5.
     lowered = jnp.maximum(0.0, CROUCHED - state.x[:, -1].mean() / rest[:, -1].mean()) / (1.0 - CROUCHED)
-    # The axis of the body's frame that points up at rest.
+    # The body axis that points up at rest.
     cosine = axes_of(task.frame, rest)[:, -1] @ axes_of(task.frame, state.x)[:, -1]
     tilt = jnp.arccos(jnp.clip(jax.lax.stop_gradient(cosine), -1.0, 1.0))
     worth = task.speed * jnp.tanh(travelled / task.speed) if task.speed else travelled
@@ -238,7 +238,7 @@ def advance(task: LocomotionTask, place: EpisodeState, change: Float[Array, " k"
 def change_of(actuation: Float[Array, " k"], command: Float[Array, " k"]) -> Float[Array, " k"]:
     """Returns the change towards the actuation of a command in [-1, 1]: 0.3 tanh((target - actuation) / 0.3).
 
-    Learners choose a target instead of the change, so that the limits bound the actuation without a flat gradient.
+    Learners choose a target instead of the change: the limits then bound the actuation without a flat gradient.
     """
     target = SHORTEST + (1.0 - SHORTEST) * 0.5 * (1.0 + command)
     return LARGEST_CHANGE * jnp.tanh((target - actuation) / LARGEST_CHANGE)
@@ -272,12 +272,12 @@ def walk(task: LocomotionTask, act: Act, start: EpisodeState, steps: int) -> tup
 def run_episode(
     task: LocomotionTask, act: Act, start: EpisodeState | None = None
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    """Runs one episode, from rest unless a start is given, and returns what `judged` says of it."""
+    """Runs one episode, from rest or from a start, and returns its distance and steps by `judged`."""
     return judged(walk(task, act, beginning(task) if start is None else start, task.episode)[1])
 
 
 def judged(seen: Walk) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    """Returns the distance of an episode in body lengths and its steps, both before a fall, if any.
+    """Returns the distance of an episode in body lengths and its number of steps, up to a fall.
 
     The distance is the criterion for policies. It is NaN if a step before a fall did not converge.
     """
@@ -287,14 +287,14 @@ def judged(seen: Walk) -> tuple[Float[Array, ""], Int[Array, ""]]:
 
 
 def fitted_frame(vertices: Float[np.ndarray, "n dim"]) -> Frame:
-    """Frame that follows all vertices: their mean, and the images of x (and y) under the least-squares affine map."""
+    """Returns a frame of all vertices: their mean, and the images of x (and y) under the least-squares affine map."""
     count, dimension = vertices.shape
     offsets = vertices - vertices.mean(axis=0)
     return Frame(np.full(count, 1 / count), np.linalg.pinv(offsets)[: dimension - 1])
 
 
 def axes_of(frame: Frame, x: Float[Array, "n dim"]) -> Float[Array, "dim dim"]:
-    """Returns the rotation R into the frame, whose rows are the axes."""
+    """Returns the rotation R into the frame, with the axes as rows."""
     a, *others = jnp.asarray(frame.axes, x.dtype) @ x
     a = a / jnp.linalg.norm(a)
     if not others:

@@ -1,8 +1,8 @@
-"""How episodes differ: perturbed starts, slopes, rough ground and pushes. Absent ones are not traced.
+"""Variation between episodes: perturbed starts, slopes, rough ground and pushes. Only stated ones are traced.
 
-A slope is a direction of gravity, which is exact for plane ground: x runs along the slope. Rough ground is a sum of
-waves of equal amplitudes with random lengths (half a body length to two), directions and phases. A push is a jump of
-the velocity of the whole body in a random horizontal direction, about every three seconds.
+A slope is a direction of gravity, exact for plane ground: x runs along the slope. Rough ground is a sum of waves of
+equal amplitudes with random lengths (half a body length to two), directions and phases. A push is a jump of the
+velocity of the whole body in a random horizontal direction, about every three seconds.
 """
 
 import math
@@ -27,12 +27,12 @@ GRAVITY = 9.8
 
 
 class Variation(NamedTuple):
-    """How episodes differ."""
+    """Variation between episodes."""
 
     start: float = 0.0
-    """Standard deviation of the vertices' initial positions in m; that of their velocities is 10/s times as large."""
+    """Standard deviation of the vertices' initial positions in m; their velocities have 10/s times this deviation."""
     slope: float = 0.0
-    """Largest slope in degrees; half of all slopes have it, and the others are uniform below it."""
+    """Largest slope in degrees; half of all slopes are this steep, and the others are uniform below."""
     rough: float = 0.0
     """Largest height of rough ground in m."""
     push: float = 0.0
@@ -43,7 +43,7 @@ FLAT = Variation()
 
 
 class World(NamedTuple):
-    """The surroundings of an episode; `None` for what the variation lacks."""
+    """The surroundings of an episode; `None` for absent variations."""
 
     gravity: Float[Array, " dim"] | None
     """In m/s²."""
@@ -55,7 +55,7 @@ class World(NamedTuple):
 
 
 def require_variation(variation: Variation) -> None:
-    """Raises `InputError` for numbers that are negative or not finite, and for slopes from 90 degrees on."""
+    """Raises `InputError` for negative or non-finite numbers, and for slopes of 90 degrees or more."""
     for name, value in variation._asdict().items():
         if not (math.isfinite(value) and value >= 0):
             raise InputError(f"{name} is {value}; expected 0 or a positive number")
@@ -64,7 +64,7 @@ def require_variation(variation: Variation) -> None:
 
 
 def level_world(variation: Variation, dimension: int) -> World:
-    """Returns the world without slope, bumps and pushes, with placeholders for those that the variation has."""
+    """Returns the world without slope, bumps and pushes, with placeholders for stated variations."""
     gravity = jnp.asarray([0.0] * (dimension - 1) + [-GRAVITY]) if variation.slope else None
     flat = Bumps(jnp.zeros(WAVES), jnp.zeros((WAVES, dimension - 1)), jnp.zeros(WAVES)) if variation.rough else None
     pushes = (jnp.asarray(0), jnp.asarray(0.0)) if variation.push else (None, None)
@@ -72,7 +72,8 @@ def level_world(variation: Variation, dimension: int) -> World:
 
 
 def drawn_world(variation: Variation, key: Array, level: World, length: float, *, steepest: bool) -> World:
-    """Draws a random world; `length` of the body in m; `steepest` takes the largest slope, in a random direction."""
+    """Draws a random world. `length` is the body length in m; `steepest` takes the largest slope, in a random
+    direction."""
     for_slope, for_direction, for_length, for_wave, for_phase, for_push = jax.random.split(key, 6)
     gravity, bumps = level.gravity, level.bumps
     if gravity is not None:
@@ -113,6 +114,6 @@ def pushed(world: World, state: State, steps: Array) -> State:
 
 
 def _direction(key: Array, shape: tuple[int, ...], dimension: int) -> Float[Array, "*shape dimension"]:
-    """Returns random unit vectors; in one dimension, signs."""
+    """Returns random unit vectors (signs in one dimension)."""
     drawn = jax.random.normal(key, (*shape, dimension))
     return drawn / jnp.linalg.norm(drawn, axis=-1, keepdims=True)

@@ -1,7 +1,7 @@
 """Arguments of one state: converts them to vectors of one floating type, or refuses them in one line.
 
-These checks run at the boundary where functions are handed out; the mechanics behind it checks nothing. Shapes are
-static, so the checks cost a compiled function nothing.
+Public functions run these checks; the mechanics behind them checks nothing. Shapes are static, so a compiled function
+runs no checks.
 """
 
 from collections.abc import Callable
@@ -24,11 +24,11 @@ def vectors(size: int | None = None, /, **arguments: Any) -> tuple[Array, ...]:
     The type is the widest floating type among them, or JAX's default if all are integers.
 
     Args:
-        size: size of all vectors; by default that of the first.
+        size: size of all vectors; by default the size of the first.
         arguments: arguments by name; `types.VectorLike` is accepted.
 
     Raises:
-        InputError: an argument, which the message names, is not real or has another shape; use `jax.vmap` for a batch.
+        InputError: an argument is not real or has another shape; the message names it. Use `jax.vmap` for a batch.
     """
     arrays = {name: _real_array(name, value) for name, value in arguments.items()}
     expected = None if size is None else (size,)
@@ -42,15 +42,15 @@ def vectors(size: int | None = None, /, **arguments: Any) -> tuple[Array, ...]:
 def require_size_of(energy: Callable[..., Any], size: int) -> None:
     """Raises `InputError` unless an energy (q, x) takes vectors [size].
 
-    It raises if the energy reads entries beyond them, or depends on neither q nor x of some coordinate. The first test
-    needs an energy that accepts NumPy arrays, the second one that does not depend on traced values.
+    The energy must not read entries beyond `size`, and must depend on q or x of every coordinate. The first test needs
+    an energy that accepts NumPy arrays, the second an energy without traced values.
     """
     q, x = 0.3 + 0.1 * np.arange(size), 0.7 + 0.2 * np.arange(size)
-    wrong = f"the system takes no states of size {size}"
+    wrong = f"the system does not take states of size {size}"
     try:
         jax.eval_shape(lambda: energy(q, x))
     except IndexError as error:  # NumPy arrays raise it; JAX would take the last element
-        raise InputError(f"{wrong} ({error}); give vectors [d] of its own size") from error
+        raise InputError(f"{wrong} ({error}); give vectors of its size") from error
     except Exception:  # an energy need not accept NumPy arrays
         pass
     with jax.ensure_compile_time_eval():
@@ -67,8 +67,8 @@ def answer(function: Callable[..., Answer], *state: Array) -> Answer:
     """Calls a system's function with vectors of one size.
 
     Raises:
-        InputError: the system has another size, an energy is no scalar, or a function of the system leaves JAX; the
-            message quotes the error of its own array operations. Other errors of the system's functions pass.
+        InputError: the system has another size, an energy is not a scalar, or a function of the system converts its
+            arguments to NumPy. The message quotes the error of the array operation. Other errors pass through.
     """
     try:
         return function(*state)
@@ -79,15 +79,15 @@ def answer(function: Callable[..., Answer], *state: Array) -> Answer:
         if isinstance(error, jax.errors.JAXTypeError | jax.errors.JAXIndexError):
             raise InputError(
                 f"a function of the system converts its arguments to NumPy or Python numbers ({reason[:200]}); use "
-                "jax.numpy, and no `float` or `if` of them"
+                "jax.numpy, without float() or `if` on them"
             ) from error
         if reason.startswith("Gradient only defined for scalar-output"):
-            raise InputError(f"an energy of the system is no scalar ({reason.partition('. To get')[0]})") from error
+            raise InputError(f"an energy of the system is not a scalar ({reason.partition('. To get')[0]})") from error
         words = ("shape", "dimension", "index")
         if "positional argument" in reason or not any(word in reason.lower() for word in words):
             raise
         raise InputError(
-            f"the system takes no states of size {state[0].shape[0]} ({reason[:200]}); give vectors [d] of its own size"
+            f"the system does not take states of size {state[0].shape[0]} ({reason[:200]}); give vectors of its size"
         ) from error
 
 
@@ -103,7 +103,7 @@ def _real_array(name: str, value: Any) -> Array:
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError, OverflowError) as error:
-        kind = "None" if value is None else f"a {type(value).__name__} that makes no array"
+        kind = "None" if value is None else f"a {type(value).__name__} that is not an array"
         raise InputError(f"{name} is {kind}; expected one vector of real numbers") from error
     if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
         raise InputError(f"{name} has type {array.dtype}; expected one vector of real numbers")

@@ -5,9 +5,9 @@ A step for controllers is x_next = F(x, u, dt), with A = dF/dx and B = dF/du:
     x = (q, qd) [2 d],   qdd = forward_dynamics(q, qd, tau),   tau = actuation u, held over the step
     x = (q, p) [2 d] in a phase space, without u
 
-A step takes a fixed number of operations: the implicit midpoint rule here takes a fixed number of Newton steps, while
-that of `mechanics.integrators` iterates until it has converged. Derivatives are exact (for the implicit step by the
-implicit function theorem at the last iterate) and share the Jacobians of `mechanics.jacobians`.
+A step takes a fixed number of operations: the implicit midpoint rule here takes a fixed number of Newton steps, whereas
+`mechanics.integrators` iterates until convergence. Derivatives are exact (for the implicit step by the implicit
+function theorem at the last iterate) and share the Jacobians of `mechanics.jacobians`.
 """
 
 import functools
@@ -33,7 +33,7 @@ Step = Callable[[Any, Any, Any], Any]
 PhaseStep = Callable[[Any, Any, Any], Any]
 """(q, p, dt) -> (q, p) after the step."""
 Torque = Literal["held", "interpolated"]
-"""Course of a recorded torque between its samples."""
+"""Assumption about a recorded torque between its samples."""
 Actuation = Sequence[Sequence[float]] | Float[np.ndarray, "d u"] | None
 """Actuation matrix of `types.Needs`; with `None`, u is tau."""
 
@@ -57,7 +57,8 @@ def implicit_midpoint(
         qdd = forward_dynamics(q + dt/2 v, v, tau),   v = qd + dt/2 qdd;   (q, qd) <- (q + dt v, qd + dt qdd)
 
     Args:
-        forward_dynamics: (q, qd, tau) -> qdd; to differentiate the step, `jacobians.differentiable_forward_dynamics`.
+        forward_dynamics: (q, qd, tau) -> qdd; use `jacobians.differentiable_forward_dynamics` if you differentiate the
+            step.
         actuation: matrix [d, u] with tau = actuation u.
         iterations: Newton steps, from the acceleration at x. If the last one still moves the state by more than
             sqrt(eps) (1 + |x|), the step is NaN: take a smaller dt. The error is about the square of the last move.
@@ -147,9 +148,9 @@ def driven(
     Args:
         rate: (state, tau) -> rate of the state.
         start: state at the first sample.
-        tau: [T - 1, d], torque at the start of every interval; a time s later it is tau + slopes s.
+        tau: [T - 1, d], torque at the start of every interval; after a time s it is tau + slopes s.
         slopes: [T - 1, d], from `torque_slopes`.
-        durations: [T - 1] in s; over a duration of zero the state stays.
+        durations: [T - 1] in s; a duration of zero leaves the state unchanged.
         method: field -> step; `integrators.looped_rk4` compiles faster.
     """
 

@@ -26,7 +26,7 @@ class Decomposition(NamedTuple):
 class Dynamics(NamedTuple):
     """Functions of an energy in coordinates and velocities, for one state; use `vmap` for samples.
 
-    Symbols and units are those of `dln_jax.types`. Analytic and learned systems have the same type, so losses, metrics,
+    `dln_jax.types` defines symbols and units. Analytic and learned systems have the same type, so losses, metrics,
     rollouts and controllers need not distinguish them. The functions take arrays or lists of numbers, and raise a
     one-line InputError for arguments that are not one state of the system.
     """
@@ -36,12 +36,13 @@ class Dynamics(NamedTuple):
     forward_dynamics: Callable[[VectorLike, VectorLike, VectorLike], Array]
     """(q, qd, tau) -> qdd [d]."""
     energy: Callable[[VectorLike, VectorLike], Array]
-    """(q, qd) -> T + V, scalar. Data leave the constant of a learned energy open and, without torques, its factor."""
+    """(q, qd) -> T + V, scalar. Data do not determine the constant of a learned energy or, without torques, its
+    scale."""
     mass_matrix: Callable[..., Array]
-    """(q, qd=None) -> M [d, d], by default at qd = 0; M of a natural system depends on q alone, others also on qd."""
+    """(q, qd=None) -> M [d, d], by default at qd = 0; M depends on qd only if the system is not natural."""
     decompose: Callable[[VectorLike, VectorLike, VectorLike], Decomposition]
-    """(q, qd, qdd) -> inertial, Coriolis and gravity forces, without friction. Data may determine gravity and friction
-    only in sum (`learning.dynamics`)."""
+    """(q, qd, qdd) -> inertial, Coriolis and gravity forces, without friction. Data may determine only the sum of
+    gravity and friction (`learning.dynamics`)."""
     friction: Callable[[VectorLike, VectorLike], Array]
     """(q, qd) -> friction force dD/dqd [d]; zero without friction."""
 
@@ -59,7 +60,17 @@ class Flow(NamedTuple):
 
 
 class InverseForward(NamedTuple):
-    """A system without energy: two functions of one state that need not be inverses of each other."""
+    """A system without energy: two functions of one state that need not be inverses of each other.
+
+    It is the record of networks without physics. `dynamics` checks the arguments and returns the same record; there is
+    no energy, no mass matrix and no flow. All vectors are [d], in SI units.
+
+    Example:
+        >>> import dln_jax
+        >>> system = dln_jax.InverseForward(lambda q, qd, qdd: 2 * qdd + 3 * qd, lambda q, qd, tau: (tau - 3 * qd) / 2)
+        >>> print(dln_jax.dynamics(system).inverse_dynamics([0.5], [1.0], [2.0]))
+        [7.]
+    """
 
     inverse_dynamics: Callable[..., Array]
     """(q, qd, qdd) -> tau [d]."""
@@ -72,7 +83,18 @@ class InverseForward(NamedTuple):
 
 
 class PhaseRates(NamedTuple):
-    """Rates of a state in a phase space."""
+    """Rates of a state in a phase space.
+
+    It is the record of vector fields that need not come from an energy. `flow` checks the arguments and returns the
+    rates, with the energy if there is one. It defines no forces, so `dynamics` raises `InputError`.
+
+    Example:
+        >>> import dln_jax
+        >>> damped = dln_jax.PhaseRates(lambda q, p: (p, -4 * q - 0.1 * p))
+        >>> qd, pd = dln_jax.flow(damped).rates([1.0], [2.0])
+        >>> print(qd, pd.round(2))
+        [2.] [-4.2]
+    """
 
     rates: Callable[..., tuple[Array, Array]]
     """(q, p) -> (qd, pd), both [d]."""
@@ -83,7 +105,7 @@ class PhaseRates(NamedTuple):
 Functions = tuple[
     Callable[..., Array], Callable[..., Array], Callable[..., Array], Callable[..., Array], Callable[..., Decomposition]
 ]
-"""The first five of `Dynamics`, of vectors [d] of one type, without friction; `mass_matrix` takes both q and qd."""
+"""The first five functions of `Dynamics`, without friction and without checks; `mass_matrix` takes both q and qd."""
 
 
 def plus_potential(kinetic: Scalar, V: Potential | None, q: Vector) -> Scalar:

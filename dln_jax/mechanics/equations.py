@@ -51,12 +51,22 @@ def dynamics(system: InverseForward, *, degrees_of_freedom: int | None = None) -
 def dynamics(system: System, *, degrees_of_freedom: int | None = None) -> Dynamics | InverseForward:
     """Returns the functions of a system in coordinates and velocities.
 
+    They solve tau = M(q) qdd + c(q, qd) + g(q) + dD/dqd for tau or for qdd, and return energy, mass matrix, torque
+    components and friction. Each takes one state with vectors [d] in SI units; use `jax.vmap` for samples.
+
     Args:
         system: a record of energies, or `InverseForward`.
-        degrees_of_freedom: d; states of another size are refused. Without it, arguments need only agree in size.
+        degrees_of_freedom: d. The functions refuse states of another size. Without it, arguments need only agree in
+            size.
 
     Raises:
-        InputError: the system is the rates of a phase space, which do not define forces, or not a record.
+        InputError: the system is a `PhaseRates`, which does not define forces, or not a record.
+
+    Example:
+        >>> import dln_jax
+        >>> cart = dln_jax.dynamics(dln_jax.LagrangianSystem(lambda q, qd: 1.5 * qd @ qd - 2.0 * q @ q))
+        >>> print(cart.inverse_dynamics([0.5], [0.0], [2.0]), cart.mass_matrix([0.5]))  # 3 qdd + 4 q in N, M in kg
+        [8.] [[3.]]
     """
     d = degrees_of_freedom
     if not isinstance(system, Driven):
@@ -127,10 +137,23 @@ def flow(system: Energies, *, degrees_of_freedom: int | None = None) -> Flow: ..
 @overload
 def flow(system: PhaseRates, *, degrees_of_freedom: int | None = None) -> Flow | PhaseRates: ...
 def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | PhaseRates:
-    """Returns the functions of a system in (q, p), without applied forces; arguments as for `dynamics`.
+    """Returns the functions of a system in (q, p), without applied forces.
+
+    The rates are dq/dt = dH/dp, dp/dt = -dH/dq - dD/dqd (Hamilton). H is the Legendre transform of a Lagrangian.
+
+    Args:
+        system: a record of energies, or `PhaseRates`.
+        degrees_of_freedom: d, as for `dynamics`.
 
     Raises:
         InputError: the system is an `InverseForward`, which has no flow, or not a record.
+
+    Example:
+        >>> import dln_jax
+        >>> cart = dln_jax.flow(dln_jax.LagrangianSystem(lambda q, qd: 1.5 * qd @ qd - 2.0 * q @ q))
+        >>> qd, pd = cart.rates([0.5], [6.0])  # p / 3 in m/s, -4 q in N
+        >>> print(qd, pd, cart.energy([0.5], [6.0]))
+        [2.] [-2.] 6.5
     """
     d = degrees_of_freedom
     if isinstance(system, PhaseRates):
@@ -151,7 +174,7 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pha
 
 
 def driving_force(system: Energies, q: Vector, qd: Vector, tau: Vector) -> Vector:
-    """Returns the generalised force [d] that is left to move the system after friction."""
+    """Returns the generalised force [d] minus friction: the part that moves the system."""
     if isinstance(system, LoadedSystem):
         return link_force(system, q, qd, tau)
     force = friction_of(system)
@@ -159,7 +182,7 @@ def driving_force(system: Energies, q: Vector, qd: Vector, tau: Vector) -> Vecto
 
 
 def hamiltonian_of(system: Energies) -> Hamiltonian:
-    """Returns H(q, p) of any energies; of a Lagrangian by the Legendre transform, in general by Newton's method."""
+    """Returns H(q, p) of any energies; of a Lagrangian by the Legendre transform (Newton's method)."""
     match system:
         case HamiltonianSystem():
             return system.hamiltonian

@@ -2,8 +2,8 @@
 
     tau = M(q) qdd + c(q, qd) + g(q) [+ dD/dqd]
 
-`closed_form` takes the terms one by one; an `ExplicitSystem` may also have their sum from one recursion over bodies.
-Both take less time than derivatives of the energy, because M is a second derivative of it.
+`closed_form` takes the terms one by one. An `ExplicitSystem` may also compute their sum in one recursion over bodies.
+Both are faster than derivatives of the energy, because M is its second derivative.
 """
 
 from collections.abc import Callable

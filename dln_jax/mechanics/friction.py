@@ -1,4 +1,4 @@
-"""Friction laws of a joint, their coefficients, and which of them enter the force linearly.
+"""Friction laws of a joint and their coefficients, linear and nonlinear.
 
 With the joint's rate u, and v, w, a, s the velocity scale, Stribeck's velocity, the sigmoid's slope and its shift,
 
@@ -12,17 +12,17 @@ With the joint's rate u, and v, w, a, s the velocity scale, Stribeck's velocity,
 | sigmoid | A / (1 + exp(-a (u + s))) - A / (1 + exp(-a s)) | A | a, s |
 | load | μ abs(tau_link) tanh(u / v) | | v, and bilinear in μ and the parameters of tau_link |
 
-Stribeck's is the usual form (Armstrong-Hélouvry, Dupont and Canudas de Wit 1994), the sigmoid that of Gaz et al. 2019
-(RA-L, the Panda). The asymmetric law passes smoothly from one direction to the other: with t = tanh(u / v) and
-k = u / √(u² + v²) it is
+The Stribeck law has the usual form (Armstrong-Hélouvry, Dupont and Canudas de Wit 1994). The sigmoid comes from Gaz et
+al. 2019 (RA-L, for the Panda). The asymmetric law changes smoothly between the directions: with t = tanh(u / v) and k =
+u / √(u² + v²) it is
 
     b₊ u (1 + k)/2 + b₋ u (1 - k)/2 + c₊ t (1 + t)/2 + c₋ t (1 - t)/2
 
 With equal coefficients this is viscous and coulomb; it dissipates power for any coefficients.
 
-Every law is the derivative of a Rayleigh function D by the rate, in W, the integral of its force from rest. The
-derivative is written out, because terms cancel in the derivative of the integral; higher derivatives are exact
-derivatives of the force.
+Every law derives from a Rayleigh function D in W, the integral of the force over the rate from rest. The force has its
+own formula, because terms cancel in the derivative of the integral. Higher derivatives are exact derivatives of the
+force.
 """
 
 import math
@@ -40,7 +40,7 @@ from dln_jax.types import Dissipation, FrictionLaw, InputError, Scalar, Vector
 
 LAWS: tuple[FrictionLaw, ...] = get_args(FrictionLaw)
 USUAL: tuple[FrictionLaw, ...] = ("viscous", "coulomb", "offset")
-"""Friction of a joint where nothing else is known."""
+"""Default friction laws of a joint."""
 
 
 class FrictionCoefficients(NamedTuple):
@@ -70,7 +70,7 @@ class FrictionShape(NamedTuple):
     """Nonlinear parameters of friction: one number per joint [d], or one for all."""
 
     velocity_scale: Any = 0.01
-    """v, 1/s or m/s, at which dry friction reaches 76 % of its force; a joint that sticks creeps more slowly."""
+    """v, 1/s or m/s: dry friction reaches 76 % of its force there. A sticking joint creeps more slowly than v."""
     stribeck_velocity: Any = 0.1
     """w, 1/s or m/s."""
     sigmoid_slope: Any = 10.0
@@ -107,15 +107,15 @@ def _in_laws(laws: Iterable[FrictionLaw], names: tuple[str, ...]) -> tuple[str, 
 
 
 def require_laws(laws: Any, name: str) -> None:
-    """Raises `InputError` unless all are laws, without duplicates, and no two describe the same friction."""
+    """Raises `InputError` for unknown or repeated laws, and for two laws that describe the same friction."""
     if unknown := [law for law in laws if law not in LAWS]:
         raise InputError(f"{name} has {unknown[0]!r:.40}; expected some of {', '.join(LAWS)}")
     if len(set(laws)) < len(laws):
         raise InputError(f"{name} is {list(laws)}; expected each law once")
     if "asymmetric" in laws and (twice := [law for law in ("viscous", "coulomb") if law in laws]):
         raise InputError(
-            f"{name} has asymmetric and {' and '.join(twice)}, which no data can tell apart; leave one out: asymmetric "
-            "has both frictions, in each direction"
+            f"{name} has asymmetric and {' and '.join(twice)}, and no data can tell them apart; leave "
+            f"{' and '.join(twice)} out: asymmetric has viscous and dry friction in each direction"
         )
 
 
@@ -124,7 +124,7 @@ NODES, WEIGHTS = (0.5 * (x + shift) for x, shift in zip(np.polynomial.legendre.l
 
 
 def integral(value: Callable[..., Array], slope: Callable[..., Array]) -> Callable[..., Array]:
-    """Returns the function value(x, *rest), elementwise in x, whose derivative by x is `slope(x, *rest)`."""
+    """Returns the function value(x, *rest), elementwise in x, with the derivative `slope(x, *rest)` by x."""
     function = jax.custom_jvp(value)
 
     def rule(primals, tangents):
@@ -147,7 +147,7 @@ def _log_cosh(x: Vector) -> Vector:
 
 
 def _dry(side: int) -> Callable[[Vector], Vector]:
-    """Dry friction on one side of rest, where (1 ± tanh x)/2 is 1; it is 0 on the other."""
+    """Returns dry friction in one direction: (1 ± tanh x)/2 is 1 on that side of rest and 0 on the other."""
     return integral(
         lambda x: 0.5 * (_log_cosh(x) + side * (x - jnp.tanh(x))),
         lambda x: jnp.tanh(x) * (0.5 * (1 + side * jnp.tanh(x))),
@@ -205,7 +205,7 @@ POTENTIALS: Mapping[str, Callable[[Vector, FrictionShape], Vector]] = {
     "coulomb_backward": _scaled(_dry(-1)),
     "sigmoid": _sigmoid,
 }
-"""Rayleigh function, in W, of a unit coefficient by its name, [d] for the joints."""
+"""Name of a coefficient -> Rayleigh function of the joints [d], in W, for a unit coefficient."""
 
 
 def unit_force(coefficient: str, u: Vector, shape: FrictionShape) -> Vector:
@@ -232,17 +232,25 @@ def joint_dissipation(
 ) -> Dissipation | None:
     """Returns (q, qd) -> D in W, or `None` if all coefficients are absent or known to be zero.
 
-    D is the sum of the laws' integrals over all joints. It is smooth at rest, and non-negative for non-negative
-    coefficients (except the part of the offset, which is not a loss). The force is exactly that of the table.
+    D is the Rayleigh function of all joints: the friction force dD/dqd is exactly the sum of the laws in the table of
+    `mechanics.friction`. D is smooth at rest. It is non-negative for non-negative coefficients, except for the offset,
+    which is not a loss.
 
     Args:
         viscous, coulomb, offset, stribeck: as in `FrictionCoefficients`; one per joint [d] or one for all.
         viscous_forward, viscous_backward, coulomb_forward, coulomb_backward, sigmoid: likewise.
         velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift: as in `FrictionShape`.
-        joint_map: known J [d, d] that maps rates of the coordinates to joint rates J qd; the force is Jᵀ dD/du.
+        joint_map: known matrix J [d, d] in joint rates = J qd; the force is Jᵀ dD/du.
 
     Raises:
         InputError: a known coefficient is negative or not finite, or a known velocity or slope is not positive.
+
+    Example:
+        >>> import dln_jax
+        >>> D = dln_jax.joint_dissipation(viscous=[0.5, 0.1], coulomb=2.0)  # N m s, N m
+        >>> arm = dln_jax.dynamics(dln_jax.LagrangianSystem(lambda q, qd: 0.5 * qd @ qd, D))
+        >>> print(arm.friction([0.0, 0.0], [1.0, -1.0]).round(2))
+        [ 2.5 -2.1]
     """
     coefficients = FrictionCoefficients(
         viscous, coulomb, offset, stribeck,
@@ -253,7 +261,7 @@ def joint_dissipation(
     terms: dict[str, Any] = {}
     for name, value in coefficients._asdict().items():
         loss = name != "offset"
-        known = _known(name, value, "finite numbers" + ", none of them negative" * loss, 0.0 if loss else -np.inf)
+        known = _known(name, value, "finite numbers" + " of at least 0" * loss, 0.0 if loss else -np.inf)
         if value is not None and (known is None or known.any()):
             terms[name] = value
     if not terms:
@@ -276,14 +284,14 @@ def joint_rates(joint_map: Any, qd: Vector) -> Vector:
 
 
 def require_shape(shape: FrictionShape) -> None:
-    """Raises `InputError` for a known velocity or slope that is not positive, or a shift that is not finite."""
+    """Raises `InputError` if a known velocity or slope is not positive, or a shift is not finite."""
     for name, value in shape._asdict().items():
         kind, least = ("finite", -np.inf) if name == "sigmoid_shift" else ("positive", np.finfo(float).tiny)
         _known(name, value, f"a {kind} number, or one for each joint", least)
 
 
 def _known(name: str, value: Any, expected: str, least: float) -> np.ndarray | None:
-    """Numbers that are known, `None` for others; `InputError` unless they are finite and none is below the least."""
+    """Returns known numbers as an array and `None` for traced ones; `InputError` if one is not finite or too small."""
     if not isinstance(value, int | float | np.ndarray | np.generic | list | tuple):
         return None
     known = np.asarray(value, float)

@@ -29,11 +29,24 @@ Energy = Callable[[Array, Array], Array]
 Guess = Callable[[Array, Array], Array]
 """(q, slope [d]) -> initial value of a Newton iteration [d]."""
 MOST_STEPS = 30
-"""Largest number of Newton steps; the Legendre transform is NaN if they do not suffice."""
+"""Largest number of Newton steps; without convergence the Legendre transform is NaN."""
 
 
 class HamiltonianSystem(NamedTuple):
-    """Energies of any Hamiltonian system, as functions of one state, and settings of the momentum solve."""
+    """Energies of any Hamiltonian system, as functions of one state, and settings of the momentum solve.
+
+    `flow` returns Hamilton's equations dq/dt = dH/dp, dp/dt = -dD/dqd - dH/dq. `dynamics` returns the equations in
+    coordinates and velocities; a Newton iteration then solves dH/dp = qd for the momentum. All vectors are [d], in SI
+    units.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import dln_jax
+        >>> pendulum = dln_jax.HamiltonianSystem(lambda q, p: 0.5 * p[0] ** 2 - 9.81 * jnp.cos(q[0]))
+        >>> qd, pd = dln_jax.flow(pendulum).rates([0.5], [1.0])
+        >>> print(qd, pd.round(2))
+        [1.] [-4.7]
+    """
 
     hamiltonian: Hamiltonian
     """(q, p) -> H, scalar."""
@@ -71,10 +84,10 @@ def conjugate(
 
     Takes full Newton steps from `initial_guess(q, slope)`, by default from zero, until convergence. After `MOST_STEPS`
     without convergence the result and its derivatives are NaN. Steps are not damped: an energy that is not convex in x
-    may have no solution. With `iterations` their number is fixed and convergence is not checked: one step is exact for
-    an energy that is quadratic in x, as in every natural system; otherwise check `velocity(H, q, x) - slope`.
+    may have no solution. `iterations` fixes the number of steps without a test of convergence. One step is exact if the
+    energy is quadratic in x, as in every natural system. Otherwise check `velocity(H, q, x) - slope`.
 
-    Derivatives of all orders are those of the implicit function, also by values that `energy` closes over.
+    Derivatives of all orders follow from the implicit function theorem, also by values that `energy` closes over.
     Raises InputError if `iterations` is not positive.
     """
     _require_iterations(iterations)
@@ -88,7 +101,7 @@ def conjugate(
         value, hessian_product = jax.linearize(residual, x)
         return x - solve_hessian(hessian_product, value), value
 
-    def so_many(residual, start: Vector) -> Vector:
+    def fixed_count(residual, start: Vector) -> Vector:
         return jax.lax.scan(lambda x, _: (step(residual, x)[0], None), start, length=iterations)[0]
 
     def until_converged(residual, start: Vector) -> tuple[Vector, Array]:
@@ -97,8 +110,8 @@ def conjugate(
         def turn(state):
             count, x, _ = state
             better, left = step(residual, x)
-            # After a step this small, the error is of the order of its square. Near a root at zero this relative test
-            # fails, and the test of the residual decides.
+            # The error is about the square of such a small step. Near a root at zero this relative test fails, and the
+            # test of the residual decides.
             settled = jnp.max(jnp.abs(better - x)) < jnp.sqrt(eps) * jnp.max(jnp.abs(better))
             return count + 1, better, settled | (jnp.max(jnp.abs(left)) <= 16 * eps * jnp.max(jnp.abs(slope)))
 
@@ -113,7 +126,7 @@ def conjugate(
         return solve(jax.vmap(hessian_product)(identity), right)
 
     if iterations is not None:
-        return jax.lax.custom_root(residual, start, so_many, solve_hessian)
+        return jax.lax.custom_root(residual, start, fixed_count, solve_hessian)
     x, converged = jax.lax.custom_root(residual, start, until_converged, solve_hessian, has_aux=True)
     # A factor instead of a selection, so that derivatives also become NaN.
     return x * jnp.where(converged > 0, 1, jnp.nan).astype(x.dtype)
@@ -124,7 +137,7 @@ def legendre(energy: Energy, *, iterations: int | None = None) -> Energy:
     _require_iterations(iterations)
 
     def transform(q: Vector, slope: Vector) -> Scalar:
-        # A function with its own derivative rule needs the energy's closed-over values as arguments.
+        # A function with a custom derivative must take the values that the energy closes over as arguments.
         function, closed_over = jax.closure_convert(energy, q, slope)
         return _legendre(function, iterations, q, slope, *closed_over)
 
@@ -139,7 +152,7 @@ def _legendre(function, iterations, q, slope, *closed_over):
 
 @_legendre.defjvp
 def _legendre_jvp(function, iterations, primals, tangents):
-    """The envelope theorem: dx drops out of the first derivative, so that no solve has to be differentiated."""
+    """The envelope theorem: dx drops out of the first derivative, so no solve is differentiated."""
     q, slope, *closed_over = primals
     q_dot, slope_dot, *closed_over_dot = tangents
     x = _conjugate(function, iterations, *primals)

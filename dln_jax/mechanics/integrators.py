@@ -10,11 +10,10 @@
 | `symplectic_euler` | 1 | partitioned fields | symplectic if separable |
 | `stormer_verlet` | 2 | separable fields | symplectic, reversible |
 
-A field is `(t, state) -> rate` of a first-order system y' = f(t, y). A partitioned one has two halves,
-q' = velocity, p' = force; it is separable if the velocity reads only p and the force only q, as for H = T(p) + V(q).
-The partitioned steps are explicit. For a Hamiltonian that is not separable they would be implicit or not symplectic:
-use `implicit_midpoint` or `gauss_legendre4`.
-Source: Hairer, Lubich and Wanner, "Geometric Numerical Integration" (2006), chapters I, II and VI.
+A field is `(t, state) -> rate` of a first-order system y' = f(t, y). A partitioned field has two halves, q' = velocity
+and p' = force. It is separable if the velocity depends only on p and the force only on q, as for H = T(p) + V(q). The
+partitioned steps are explicit. For other Hamiltonians use `implicit_midpoint` or `gauss_legendre4`. Source: Hairer,
+Lubich and Wanner, "Geometric Numerical Integration" (2006), chapters I, II and VI.
 """
 
 import functools
@@ -63,8 +62,8 @@ def runge_kutta(
         stages: a [s, s].
         weights: b [s].
         field: (t, state) -> rate.
-        tolerance: largest error of the equations for Y, in the state's units, before the last Newton step, which about
-            squares it; implicit methods only.
+        tolerance: largest error of the equations for Y in the state's units before the last Newton step, which roughly
+            squares it. Implicit methods only.
         iterations: largest number of Newton steps; implicit methods only.
     """
     field = jax.jit(field)  # traced once for all stages
@@ -83,7 +82,7 @@ def runge_kutta(
         def rates(values, t, dt):
             return jax.vmap(lambda t, value: ravel_pytree(field(t, unravel(value)))[0])(t + c * dt, values)
 
-        # The unknowns are the states of the stages, whose size sets the scale of rounding even where all rates vanish.
+        # The unknowns are the states of the stages: their size sets the scale of rounding even if all rates vanish.
         def equations(values, start, t, dt):
             values = values.reshape(len(b), -1)
             return (values - start - dt * a @ rates(values, t, dt)).ravel()
@@ -109,9 +108,9 @@ radau3 = functools.partial(runge_kutta, [[5 / 12, -1 / 12], [0.75, 0.25]], [0.75
 
 
 def looped_rk4(field: Field) -> Step:
-    """Returns `rk4` with its stages in a loop, so that the program contains the field once instead of four times.
+    """Returns `rk4` with its stages in a loop: the compiled program contains the field once instead of four times.
 
-    For fits through an integrator and for motions that run once, where compilation takes longer than execution.
+    Use it where compilation takes longer than execution: fits through an integrator, and motions that run once.
     """
     nodes, weights = jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.array([1.0, 2.0, 2.0, 1.0]) / 6
 
@@ -151,7 +150,7 @@ def stormer_verlet(velocity: Callable[[Any, Any], Any], force: Callable[[Any, An
 
         p_half = p + dt/2 force(t, q),    q <- q + dt velocity(t + dt/2, p_half),    p <- p_half + dt/2 force(t + dt, q)
 
-    Order 2, symplectic and reversible. The signatures of the halves exclude fields that are not separable.
+    Order 2, symplectic and reversible. The arguments of the two halves exclude fields that are not separable.
     """
 
     def step(t, state, dt):
@@ -206,7 +205,7 @@ def rollout(step: Step, state: State, t: Float[Array | np.ndarray, " T"], *, sub
 
 
 def from_start(step: Callable[[State, Any], State], state: State, inputs: Any) -> State:
-    """Returns a state and those after each step (state, input) -> state; leaves get a leading axis."""
+    """Returns the initial state and the state after each step (state, input) -> state; leaves get a leading axis."""
     _, later = steps_in_turn(lambda state, input: (step(state, input), None), state, inputs)
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state, later)
 
@@ -223,7 +222,7 @@ def adaptive_rollout(
         tolerance: tolerance on the error per step, relative and absolute.
         max_steps: largest number of steps; states not reached are infinite.
     """
-    import diffrax  # here, because its import takes longer than that of the rest of this package
+    import diffrax  # slower to import than the rest of the package
 
     require_positive(tolerance=tolerance)
     solution = diffrax.diffeqsolve(

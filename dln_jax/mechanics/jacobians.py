@@ -1,17 +1,17 @@
-"""Jacobians of the equations of motion, in the cheapest way for the kind of system, for one state.
+"""Jacobians of the equations of motion for one state, computed as the kind of system allows at least cost.
 
 For a natural system, tau = M qdd + c + g + dD/dqd with p = M(q) qd and A = dp/dq,
 
     dtau/dqdd = M,   dtau/dqd = dM/dt + A - Aᵀ + d²D/dqd²,   dtau/dq by d tangents of tau and p together
 
-The second follows from dL/dq = ½ d(qdᵀ M qd)/dq, whose derivative by qd is Aᵀ. No tangent of a velocity or an
+The second holds because the derivative of dL/dq = ½ d(qdᵀ M qd)/dq by qd is Aᵀ. No tangent of a velocity or an
 acceleration is pushed through a network. For other systems all Jacobians come from one reverse sweep over d rows. The
 forward model is the implicit function of the inverse one:
 
     dqdd/dq = -M⁻¹ dtau/dq,   dqdd/dqd = -M⁻¹ dtau/dqd,   dqdd/dtau = M⁻¹        at qdd
 
-M⁻¹ is formed, because it is a result, and one factorisation serves the acceleration and all columns. Forward models of
-a Hamiltonian, or with a network of their own, are differentiated by a reverse sweep instead.
+M⁻¹ is itself a result, so one factorisation gives it and the acceleration. Reverse sweeps differentiate the forward
+models of Hamiltonians and of separate networks instead.
 """
 
 import functools
@@ -81,7 +81,7 @@ def differentiable_forward_dynamics(
 ) -> tuple[Callable[..., Array], Callable[..., tuple[Vector, Jacobians]]]:
     """Returns (q, qd, tau) -> qdd [d], differentiated by its Jacobians, and `forward_dynamics_jacobians`.
 
-    For derivatives in many directions, such as those of a step by its whole state, which then share one Jacobian. Both
+    Derivatives in many directions, such as those of a step by its whole state, then share one Jacobian. Both functions
     are jitted: a step that calls them several times traces, compiles and exports them once.
     """
     forward_dynamics = jax.custom_jvp(jax.jit(dynamics(system, degrees_of_freedom=degrees_of_freedom).forward_dynamics))

@@ -1,15 +1,15 @@
-"""Friction in the joints of any system, and friction of transmissions proportional to the force that they carry.
+"""Friction in the joints of any system, and transmission friction proportional to the transmitted force.
 
     tau = tau_link + μ |tau_link| tanh(u / v) + dD/dqd,   tau_link = M qdd + c + g
 
-for every joint, with the joint's rate u. Load-dependent friction has no Rayleigh function of qd, because the carried
-force depends on the acceleration. But for μ < 1 the map from tau_link to tau is piecewise linear with positive slopes
-1 ± μ tanh, and its inverse keeps the sign:
+for every joint, with the joint's rate u. Load-dependent friction has no Rayleigh function of qd, because the
+transmitted force depends on the acceleration. But for μ < 1 the map from tau_link to tau is piecewise linear with
+positive slopes 1 ± μ tanh, and its inverse keeps the sign:
 
     tau_link = y / (1 + sign(y) μ tanh(u / v)),   y = tau - dD/dqd
 
-The corner at tau_link = 0 remains: derivatives there are those of μ = 0, the mean of both sides. Free motion (tau = 0)
-has no loss by load unless other friction loads the transmission.
+The corner at tau_link = 0 remains; its derivative is the mean of both sides (μ = 0). Free motion (tau = 0) loses no
+power to load friction unless other friction loads the transmission.
 """
 
 import operator
@@ -26,14 +26,14 @@ from dln_jax.types import Dissipation, Potential, Vector
 
 
 class Load(NamedTuple):
-    """Friction proportional to the force that a transmission carries."""
+    """Transmission friction proportional to the transmitted force."""
 
     share: Any
     """μ, one per joint [d] or one for all, 0 <= μ < 1."""
     velocity_scale: Any = 0.01
     """v, 1/s or m/s."""
     joint_map: Any = None
-    """Known matrix J [d, d] of joint rates J qd; `None` if the coordinates are those of the joints."""
+    """Known matrix J [d, d] in joint rates = J qd; `None` if the coordinates are the joints' own."""
 
 
 class LoadedSystem(NamedTuple):
@@ -43,7 +43,7 @@ class LoadedSystem(NamedTuple):
     """The record without dissipation."""
     load: Load
     dissipation: Dissipation | None = None
-    """(q, qd) -> Rayleigh function D, scalar, of the other friction that the motors overcome."""
+    """(q, qd) -> Rayleigh function D, scalar, of the motors' own friction."""
 
     @property
     def potential(self) -> Potential | None:
@@ -59,7 +59,7 @@ def with_friction(system: Any, dissipation: Dissipation | None, load: Load | Non
     Args:
         system: one of `mechanics.equations.System`.
         dissipation: (q, qd) -> Rayleigh function, as from `joint_dissipation`.
-        load: load-dependent friction of the transmissions; all other friction is then on their motors' side.
+        load: load-dependent friction of the transmissions; all other friction then acts on the motor side.
 
     Returns:
         The record, or with a load a `LoadedSystem`.
@@ -95,7 +95,7 @@ def _through(load: Load, qd: Vector, tau: Vector, by: Callable[[Array, Array], A
     J = None if load.joint_map is None else np.asarray(load.joint_map, float)
     at_joints = tau if J is None else jnp.asarray(np.linalg.inv(J).T, tau.dtype) @ tau
     slope = jnp.asarray(load.share, qd.dtype) * jnp.tanh(joint_rates(load.joint_map, qd) / load.velocity_scale)
-    # By the sign, whose derivative is 0; that of the absolute value is one-sided.
+    # The sign has derivative 0; the derivative of the absolute value would be one-sided.
     at_joints = by(at_joints, 1 + jnp.sign(at_joints) * slope)
     return at_joints if J is None else jnp.asarray(J, tau.dtype).T @ at_joints
 

@@ -2,8 +2,8 @@
 
     d/dt dL/dqd - dL/dq = tau        (Euler-Lagrange)
 
-Only the necessary derivatives are taken: the inverse model is one `jvp` of the gradient; the forward model adds the
-Hessian by qd, in a linear solve. Nothing is regularised: a singular mass matrix gives non-finite accelerations.
+The inverse model is one `jvp` of the gradient. The forward model also solves a linear system with the Hessian by qd.
+Nothing is regularised: a singular mass matrix gives non-finite accelerations.
 """
 
 from functools import partial
@@ -19,7 +19,19 @@ from dln_jax.types import Dissipation, Lagrangian, Matrix, Scalar, Vector
 
 
 class LagrangianSystem(NamedTuple):
-    """Energies of any Lagrangian system, as functions of one state."""
+    """Energies of any Lagrangian system, as functions of one state.
+
+    `dynamics` returns the equations d/dt dL/dqd - dL/dq + dD/dqd = tau (Euler-Lagrange, with a Rayleigh function D). A
+    singular mass matrix d²L/dqd² gives non-finite accelerations. All vectors are [d], in SI units.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import dln_jax
+        >>> pendulum = dln_jax.LagrangianSystem(lambda q, qd: 0.5 * qd[0] ** 2 + 9.81 * jnp.cos(q[0]))
+        >>> acceleration = dln_jax.dynamics(pendulum).forward_dynamics([0.5], [0.0], [1.0])  # tau - 9.81 sin q
+        >>> print(f"{acceleration[0]:.3f} 1/s²")
+        -3.703 1/s²
+    """
 
     lagrangian: Lagrangian
     """(q, qd) -> L, scalar."""
@@ -59,7 +71,7 @@ def forward_dynamics(L: Lagrangian, q: Vector, qd: Vector, tau: Vector) -> Vecto
 def functions(system: LagrangianSystem, degrees_of_freedom: int | None) -> Functions:
     """Returns the functions of the system.
 
-    Without `degrees_of_freedom`, they refuse states that lack entries which L reads, or have rates that L ignores.
+    Without `degrees_of_freedom`, they refuse states that are too short for L, and states with rates that L ignores.
     """
     accepted = {degrees_of_freedom}
 

@@ -19,7 +19,18 @@ from dln_jax.types import CholeskyFactor, Dissipation, Hamiltonian, Lagrangian, 
 
 
 class NaturalSystem(NamedTuple):
-    """Energies of a natural system with a factor of the mass matrix, as functions of one state."""
+    """Energies of a natural system with a factor of the mass matrix, as functions of one state.
+
+    The Lagrangian is ½ |Lᵀ qd|² - V(q) with the mass matrix M = L Lᵀ, which is definite if the diagonal of L has no
+    zero (Lutter, Ritter and Peters 2019). `dynamics` returns its equations of motion. All units are SI.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import dln_jax
+        >>> arm = dln_jax.NaturalSystem(lambda q: jnp.sqrt(jnp.array([[2.0]])), lambda q: 19.62 * jnp.sin(q[0]))
+        >>> print(dln_jax.dynamics(arm).inverse_dynamics([0.5], [1.0], [2.0]).round(2))  # 2 qdd + 19.62 cos q, N m
+        [21.22]
+    """
 
     cholesky: CholeskyFactor
     """q -> lower triangular L [d, d], M = L Lᵀ."""
@@ -30,7 +41,19 @@ class NaturalSystem(NamedTuple):
 
 
 class NaturalHamiltonian(NamedTuple):
-    """Energies of a natural system with a factor of the inverse mass matrix, as functions of one state."""
+    """Energies of a natural system with a factor of the inverse mass matrix, as functions of one state.
+
+    The Hamiltonian is ½ |Lᵀ p|² + V(q) with M⁻¹ = L Lᵀ. Compared with `HamiltonianSystem`, the momentum of a velocity
+    takes two triangular solves and no Newton iteration. All units are SI.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import dln_jax
+        >>> arm = dln_jax.NaturalHamiltonian(lambda q: jnp.sqrt(jnp.array([[0.5]])), lambda q: 19.62 * jnp.sin(q[0]))
+        >>> qd, pd = dln_jax.flow(arm).rates([0.5], [2.0])  # p / 2 in 1/s, -19.62 cos q in N m
+        >>> print(qd.round(2), pd.round(2))
+        [1.] [-17.22]
+    """
 
     inverse_factor: CholeskyFactor
     """q -> lower triangular L [d, d], M⁻¹ = L Lᵀ."""
@@ -46,7 +69,7 @@ def lagrangian(system: NaturalSystem) -> Lagrangian:
 
 
 def hamiltonian(system: NaturalSystem | NaturalHamiltonian) -> Hamiltonian:
-    """Returns H(q, p) = T + V: ½ |L⁻¹ p|² + V(q) with the factor of M, ½ |Lᵀ p|² + V(q) with that of M⁻¹."""
+    """Returns H(q, p) = T + V: ½ |L⁻¹ p|² + V(q) with the factor of M, ½ |Lᵀ p|² + V(q) with the factor of M⁻¹."""
     if isinstance(system, NaturalHamiltonian):
         return lambda q, p: plus_potential(_half_square(system.inverse_factor(q).T @ p), system.potential, q)
     return lambda q, p: plus_potential(_half_square(solve_lower(system.cholesky(q), p)), system.potential, q)

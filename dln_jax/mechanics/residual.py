@@ -1,9 +1,9 @@
-"""Residual of a known system in the form of additional energies, for one state.
+"""Corrections of a known system by additional energies, for one state.
 
     tau = tau_known + d/dt dT/dqd - dT/dq + dV/dq + dD/dqd,   T = ½ |Lᵀ qd|²
 
-A potential explains forces that repeat with the position (springs, cables, gear teeth), a Rayleigh function forces that
-also depend on the velocity, and a kinetic energy, which can only add inertia, flexible parts.
+A potential explains forces that depend on the position (springs, cables, gear teeth). A Rayleigh function explains
+forces that also depend on the velocity. A kinetic energy, which can only add inertia, explains flexible parts.
 """
 
 from functools import partial
@@ -22,7 +22,7 @@ from dln_jax.types import CholeskyFactor, Dissipation, Potential, Scalar, Vector
 
 
 class Residual(NamedTuple):
-    """Energies added to those of a system; `None` for absent ones."""
+    """Energies added to a system; `None` for absent terms."""
 
     potential: Potential | None = None
     """q -> V, scalar."""
@@ -33,12 +33,12 @@ class Residual(NamedTuple):
 
 
 def with_residual(system: Any, residual: Residual) -> ExplicitSystem | LagrangianSystem | LoadedSystem:
-    """Adds energies to those of a system.
+    """Adds energies to a system.
 
     In a `LoadedSystem`, potential and inertia are added behind the transmission, and dissipation before it.
 
     Args:
-        system: any record of a natural system, a Lagrangian, or one of them behind transmissions.
+        system: a natural system, a Lagrangian, or a `LoadedSystem` of one.
     """
     V, D, factor = residual
     if isinstance(system, LoadedSystem):

@@ -6,12 +6,13 @@
     (qd, pd) = J grad H + grad F,   J grad H = (dH/dp, -dH/dq),   grad F = (dF/dq, dF/dp)
 
 The first two are separate networks, so one need not invert the other. The third is the baseline of Greydanus, Dzamba
-and Yosinski (2019). These three have no energy, mass matrix or force decomposition, so absent forces save nothing.
+and Yosinski (2019). These three have no energy, mass matrix or force decomposition, and leaving out gravity or friction
+saves nothing.
 
-The last one is a Helmholtz decomposition, published in the same paper with the same canonical J and the same names. The
-solenoidal part J grad H has no divergence and conserves H; the conservative part grad F has no rotation. H and F are
-networks of [features(q), p / momentum_scale]. F can represent friction without a Rayleigh function of (q, qd): for a
-damped spring it is F = -½ c p². Fields without divergence and rotation may be in either part.
+The last one is a Helmholtz decomposition from the same paper, with its canonical J and its names. The solenoidal part J
+grad H has no divergence and conserves H; the conservative part grad F has no rotation. H and F are networks of
+[features(q), p / momentum_scale]. F can represent friction without a Rayleigh function of (q, qd): for a damped spring
+it is F = -½ c p². A field without divergence and rotation can be in either part.
 
 A differential network, or an ensemble of them, is a function of x with its Jacobian and Hessian.
 """
@@ -113,7 +114,7 @@ def make_helmholtz(
     momentum_scale: Scale = 1.0,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """Returns the (init, energies) pair of a field of rates; with a solenoidal part, H is the energy of its flow.
+    """Returns the (init, energies) pair of a field of rates; H of the solenoidal part is the energy of its flow.
 
     Args:
         field: parts of the field: "solenoidal" is a Hamiltonian network, "conservative" a gradient, or "both".
@@ -165,13 +166,13 @@ class FunctionModel(NamedTuple):
     init: Callable[[Array], Layers]
     """Random key -> layers, with ensemble members on the leading axis, even for one member."""
     derivatives: Callable[[Layers], Callable[[VectorLike], Derivatives]]
-    """Layers -> function of x [n], which checks its argument."""
+    """Layers -> function of x [n] that checks its argument."""
 
 
 def make_differential_network(
     *, sizes: tuple[int, ...], activation: Activation, members: int, dtype: DTypeLike = jnp.float32
 ) -> FunctionModel:
-    """Makes the model of `nn.differential_mlp`.
+    """Returns an ensemble of the networks in `nn.differential_mlp`.
 
     Args:
         sizes: (inputs n, hidden widths ..., outputs m).

@@ -1,4 +1,4 @@
-"""Hamiltonian models: neural networks of three kinds, their dissipation, bodies in pairs, and polynomials.
+"""Hamiltonian models: three kinds of neural network, dissipation, pair interactions of bodies, and polynomials.
 
     structured:   H = ½ |L(q)ᵀ p|² + V(q),  M⁻¹ = L Lᵀ,  diag L = softplus(x + shift) + floor
     black-box:    H = network([features(q), p / momentum_scale])
@@ -7,26 +7,29 @@
     pairwise:     H = sum_i |p_i|² / (2 m_i) + sum over pairs of U(r_ij),   U(r) = w·f(r) + network(f(r))
     polynomial:   H = sum_k c_k phi_k(q, p)
 
-The black-box model is that of Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks". The structured one
-follows Lutter and Peters 2021, with a network for the inverse mass matrix, and the separable one Chen et al. 2020,
-"Symplectic recurrent neural networks". The separable model cannot express products of q and p, so explicit symplectic
-steps (`mechanics.integrators.stormer_verlet`) apply to it. It fits systems whose kinetic energy depends on p alone.
+The black-box model comes from Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks". The structured model
+follows Lutter and Peters 2021, with a network for the inverse mass matrix. The separable model follows Chen et al.
+2020, "Symplectic recurrent neural networks". The separable model cannot express products of q and p, so explicit
+symplectic steps (`mechanics.integrators.stormer_verlet`) apply to it. It suits systems with a kinetic energy of p
+alone.
 
 `mechanics.equations.flow` turns all of them into Hamilton's equations, and `dynamics` into equations in velocities.
 
 In the pairwise model, q and p hold one body after the other, [bodies * dimension], or with `order="axes"` one axis
 after the other (x1, x2, .., y1, y2, ..), as in many published files. H depends only on distances, so total momentum and
-angular momentum are conserved for any parameters; identical bodies may be exchanged.
+angular momentum are conserved for any parameters, and identical bodies are interchangeable.
 
 The features f of r, in units of `distance_scale`, are r, 1/r and log r by default: the potentials of a constant force
-and of Newton's and Coulomb's law, in space and in the plane. Their linear term w·f is exact for these laws and does not
-saturate as bodies approach; the network learns the rest. To assume none of these laws, leave their features out. At
-r = 0 the energy (with 1/r or log r) and its derivative are not finite: there is no softening.
+and of the laws of Newton and Coulomb in space (1/r) and in the plane (log r). Their linear term w·f is exact for these
+laws and does not saturate as bodies approach; the network learns the rest. Leave out the features of laws that you do
+not want to assume. At r = 0 the energy (with 1/r or log r) and its derivative are not finite, because there is no
+softening.
 
-The phi_k of the polynomial model are all products, up to a total degree, of powers of p_j, of powers of the
-displacements of prismatic joints, and of cos(n q_j) and sin(n q_j), of degree n, for revolute joints. No motion shows
-the constant, so it is left out. Hamilton's equations are linear in c: linear least squares identifies c from the rates
-of states (`learning.matching.match_linear`). The number of terms grows exponentially with the coordinates.
+The functions phi_k of the polynomial model are all products up to a total degree. Their factors are powers of p_j,
+powers of prismatic displacements, and cos(n q_j) and sin(n q_j), of degree n, for revolute joints. The constant has no
+effect on a motion and is left out. Hamilton's equations are linear in c: linear least squares identifies c from states
+and their rates (`learning.matching.match_linear`). The number of terms grows exponentially with the number of
+coordinates.
 """
 
 import itertools
@@ -96,9 +99,9 @@ def make_black_box_hamiltonian(
 ) -> Model:
     """Returns the (init, energies) pair of a black-box Hamiltonian network.
 
-    Hamilton's equations hold for any parameters and need no solve for the momentum. Functions of (q, qd) do, and for an
-    untrained network it may have no solution. They also need an activation with curvature in p, since M⁻¹ is the second
-    derivative by p. Leaving out gravity saves nothing.
+    Hamilton's equations hold for any parameters and need no solve for the momentum. Functions of (q, qd) do need it,
+    and with an untrained network it may have no solution. They also need an activation with curvature in p, because M⁻¹
+    is the second derivative by p. Leaving out gravity saves nothing.
 
     Args:
         momentum_scale: typical size of p; the network's input is divided by it.
@@ -162,12 +165,12 @@ def make_dissipative(
     initial_friction: float = 0.05,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """Adds friction that may depend on q to a Hamiltonian `Model`, so that it loses energy for any parameters.
+    """Adds friction that may depend on q to a Hamiltonian `Model`, which then loses energy for any parameters.
 
     Args:
         make: needs -> the model.
         needs: needs of the scene; without friction the keywords have no effect.
-        friction_width: hidden units of the network for c; 0 keeps the constant coefficients, as in `make`.
+        friction_width: hidden units of the network for c; 0 keeps the constant coefficients of `make`.
         initial_friction: approximate initial value of c, in N m s or N s/m.
         friction_depth, friction_activation, dtype: keywords of the network, as described in `models.model`.
 
@@ -223,7 +226,7 @@ def make_pairwise_hamiltonian(
         needs: prismatic coordinates of at least two bodies, without friction.
         dimension: coordinates per body.
         order: order of the coordinates, body by body (x1, y1, x2, y2) or axis by axis (x1, x2, y1, y2).
-        alike: whether all bodies share one mass and all pairs one energy; otherwise they have their own.
+        alike: all bodies share one mass and all pairs one energy; otherwise each has its own.
         features: names from `FEATURES`.
         distance_scale: typical distance in m; distances are divided by it.
         width, depth, activation, dtype: as described in `models.model`.
@@ -237,16 +240,16 @@ def make_pairwise_hamiltonian(
     has_friction = needs.friction or needs.joint_friction
     if set(needs.joints) != {"prismatic"} or needs.degrees_of_freedom % dimension or has_friction:
         raise InputError(
-            f"the pairwise model takes positions of bodies, {dimension} for each, without friction; it got {needs}"
+            f"the pairwise model needs {dimension} prismatic coordinates per body and no friction; got {needs}"
         )
     if (bodies := needs.degrees_of_freedom // dimension) < 2:
-        raise InputError(f"bodies is {bodies}; expected at least 2, since the energy is one of pairs")
+        raise InputError(f"bodies is {bodies}; expected at least 2: the energy is a sum over pairs")
     if order not in ("bodies", "axes"):
         raise InputError(f"order is {order!r}; expected 'bodies' (x1, y1, x2, y2) or 'axes' (x1, x2, y1, y2)")
     if not features or len(set(features)) < len(features) or not set(features) <= set(FEATURES):
         raise InputError(f"features are {features}; expected some of {', '.join(FEATURES)}, each once")
     first, second = np.triu_indices(bodies, 1)
-    # Rows subtract one body's position from another's.
+    # Each row subtracts the positions of two bodies.
     difference = np.eye(bodies)[first] - np.eye(bodies)[second]
     kinds = 1 if alike else len(difference)
 
@@ -284,19 +287,17 @@ def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLi
         InputError: the scene has friction, the degree is below 2, or there are more than `MOST_TERMS` terms.
     """
     if needs.friction or needs.joint_friction:
-        raise InputError(
-            "the polynomial Hamiltonian conserves energy; take a dissipative model for needs with friction"
-        )
+        raise InputError("the polynomial Hamiltonian conserves energy; use a dissipative model for friction")
     if degree < 2:
         raise InputError(f"degree is {degree}; expected at least 2, since kinetic energy is quadratic in p")
     d = needs.degrees_of_freedom
-    # Degrees of the functions of one variable, in the order of their table: 1, then x^n, or cos nx and sin nx.
+    # Degrees of the functions of one variable, ordered as in their table: 1, then x^n, or cos nx and sin nx.
     powers = list(range(degree + 1))
     harmonics = [(place + 1) // 2 for place in range(2 * degree + 1)]
     choices = [harmonics if joint == "revolute" else powers for joint in needs.joints] + [powers] * d
     most = math.prod(map(len, choices))
     if most > MOST_TERMS * 100:
-        raise InputError(f"{d} coordinates to degree {degree} make too many terms; lower the degree")
+        raise InputError(f"{d} coordinates of degree {degree} give too many terms; lower the degree")
     terms = np.array(
         [
             [place for place, _ in term]
@@ -305,7 +306,7 @@ def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLi
         ]
     )
     if len(terms) > MOST_TERMS:
-        raise InputError(f"degree {degree} makes {len(terms)} terms; the limit is {MOST_TERMS}: lower the degree")
+        raise InputError(f"degree {degree} gives {len(terms)} terms; the limit is {MOST_TERMS}: lower the degree")
 
     def table(revolute: bool, x: Scalar) -> Float[Array, " functions"]:
         orders = range(1, degree + 1)

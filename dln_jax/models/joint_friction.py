@@ -1,14 +1,14 @@
-"""Adds joint friction to any model, with the laws that the needs name.
+"""Joint friction for any model, with the laws named in the needs.
 
-All models share the parametrisation of this module. Models trained by descent have parameters x with
+All models share this parametrisation. Models trained by gradient descent have parameters x with
 
     coefficients = softplus(x) > 0, offsets = x, sigmoid's shift = x, share of load = 1 / (1 + exp(-x)) in (0, 1)
     Stribeck's velocity and the sigmoid's slope = default exp(x) > 0
 
-The velocity scale is fixed, since only the user knows which steps the integrator takes. In models that are linear in
-their parameters, the coefficients themselves are parameters, fitted by one least-squares problem. They may become
-negative, which shows that the data do not identify the law. There, shapes keep their defaults (`learning.friction` fits
-them), and load, which multiplies the forces of the energies, is refused.
+The velocity scale is fixed, since only the user knows the step of the integrator. In models that are linear in their
+parameters, the coefficients themselves are parameters of one least-squares problem. A negative coefficient then shows
+that the data do not identify the law. Shapes keep their defaults there (`learning.friction` fits them), and load
+friction is refused, because it multiplies the forces of the energies.
 """
 
 from typing import Any, NamedTuple
@@ -37,7 +37,7 @@ HELD = "velocity_scale"
 
 
 class FrictionParameters(NamedTuple):
-    """Parameters of joint friction by name, for the laws in use; linear coefficients are separate from the others."""
+    """Parameters of the friction laws in use, by name; linear coefficients are separate from the shapes."""
 
     coefficients: dict[str, Any]
     """Arrays [d] named as in `FrictionCoefficients`, before the parametrisation above."""
@@ -57,10 +57,10 @@ def with_joint_friction(
 
     Args:
         model: model of coordinates, of a phase space, or without an energy; built for needs without joint friction.
-        needs: `joint_friction` names the laws, `joint_map` maps coordinates to joints, and `velocity_scale` is that of
-            dry friction. Without laws the model is returned unchanged.
+        needs: `joint_friction` names the laws, `joint_map` maps coordinates to joints, and `velocity_scale` smooths dry
+            friction. Without laws the model is returned unchanged.
         linear: keeps a model linear in its parameters.
-        shape: initial values of learned shapes, values of fixed ones; by default the velocity scale of the needs.
+        shape: initial values of learned shapes and values of fixed shapes; by default the velocity scale of the needs.
         dtype: type of the friction parameters.
 
     Raises:
@@ -72,7 +72,7 @@ def with_joint_friction(
         return model
     if linear and "load" in laws:
         raise InputError(
-            "friction by load multiplies what the energies give, so that the model is not linear in its parameters; "
+            "load friction multiplies the forces of the energies, so the model is not linear in its parameters; "
             "leave load out, or train a network"
         )
     start = FrictionShape(velocity_scale=needs.velocity_scale) if shape is None else shape

@@ -1,23 +1,23 @@
-"""Lagrangian of a Gaussian process over trigonometric energies: as many numbers as equations, for any number of joints.
+"""Gaussian-process Lagrangian over trigonometric energies, with one weight per measured torque.
 
-The basis of `models.trigonometric` has 5^d functions for an arm of d joints that is not planar. Here they are never
-formed. T and V are independent Gaussian processes, and the model is their mean conditioned on torques:
+The basis of `models.trigonometric` has 5^d functions for a non-planar arm of d joints. This model never forms them. T
+and V are independent Gaussian processes, and the model is their mean conditioned on torques:
 
     L(q, qd) = sum over samples n, joints i of weights[n, i] cov(L(q, qd), tau_i(q_n, qd_n, qdd_n))
 
-Covariances are those of a chain of bodies with random frames and inertias. The velocity of body l has covariance k_l,
+The covariances describe a chain of bodies with random frames and inertias. The velocity of body l has covariance k_l,
 
     k_l(x, x') = c_l(q_l, q_l') k_(l-1)(x, x') + rates_l qd_l qd_l',   cov(T, T') = sum over l of inertia_l k_l²
     cov(V, V') = sum over l of weight_l h_1(q_1, q_1') .. h_l(q_l, q_l')
 
 with c_l(q, q') = a_l + b_l cos(q - q') for a revolute joint and a_l + b_l q q' for a prismatic one. h_l has the same
 form (squared for a prismatic joint, so that it includes springs). V thus has degree 1 in the cosine and sine of every
-angle and T degree 2. Both depend on the same joints as in a chain of rigid bodies: T not on the first. If the order of
-the bodies is unknown (`serial=False`), all rates enter before the first joint and only the last body has an energy:
-every entry of M can then be any function of that degree in every joint.
+angle and T degree 2. As in a chain of rigid bodies, T does not depend on the first joint. If the order of the bodies is
+unknown (`serial=False`), all rates enter before the first joint and only the last body has an energy: every entry of M
+can then be any function of that degree in every joint.
 
-The formulation of a Lagrangian process as a linear problem of N d equations is that of Giacomuzzo, Carli, Romeres and
-Dalla Libera, T-RO 2024 (arXiv 2310.06585), whose kernel is a sum over links of products over all joints up to the link.
+Giacomuzzo, Carli, Romeres and Dalla Libera (T-RO 2024, arXiv 2310.06585) formulated a Lagrangian process as a linear
+problem of N d equations. Their kernel is a sum over links of products over all joints up to the link.
 `learning.kernel.fit_kernel` fits the parameters.
 
 The fit needs covariances between the torques of states. With v the velocity of a body, a random linear function of the
@@ -26,7 +26,8 @@ rates, and T = vᵀ A v, A random and symmetric,
     tau_i = 2 (P_iᵀ A dv/dt + Q_iᵀ A v),   P_i = dv/dqd_i,   Q_i = d/dt P_i - dv/dq_i
 
 A covariance of torques is a sum of products of two inner products, <P_i, P_j'> <dv/dt, dv'/dt> and seven more. One pass
-along the joints gives all of them, since P, Q, v and dv/dt of a body are linear in those of the body before.
+along the joints gives all of them, since P, Q, v and dv/dt of a body are linear in the same quantities of the previous
+body.
 """
 
 import functools
@@ -48,9 +49,9 @@ from dln_jax.models.model import Model
 from dln_jax.types import InputError, JointKind, Needs, Scalar, Vector
 
 CHUNK = 24
-"""Number of samples per chunk, small enough that C code for seven joints fits its stack."""
+"""Number of samples per chunk; C code for seven joints then fits its stack."""
 PAIRS = 500
-"""Number of pairs of states per block, which fit into cache."""
+"""Number of pairs of states per block; a block fits into the cache."""
 
 
 class KernelScales(NamedTuple):
@@ -91,14 +92,14 @@ Factor = tuple[Array, Array, Array, Array]
 def make_trigonometric_kernel(
     needs: Needs, *, samples: int = 600, serial: bool = True, dtype: DTypeLike = jnp.float64
 ) -> Model:
-    """Returns the (init, energies) pair; `init` draws random samples and weights, which only have the right shapes.
+    """Returns the (init, energies) pair; `init` draws random samples and weights of the right shapes.
 
     One call of the inverse model takes about n d operations, one mass matrix n d³.
 
     Args:
         needs: kinds of joints, gravity, and viscous friction of the coordinates.
-        samples: n, number of samples whose torques define the energy; the fit takes n³ d³ operations.
-        serial: whether joints form a serial chain; otherwise nothing is assumed about their order.
+        samples: n, number of training samples that define the energy; the fit takes n³ d³ operations.
+        serial: the joints form a serial chain; otherwise their order is arbitrary.
         dtype: type of the parameters; weights have either sign and cancel, so f32 costs accuracy.
 
     Raises:
@@ -167,7 +168,7 @@ def _system(parameters: KernelParameters, joints: tuple[JointKind, ...], serial:
     potential = _potential(parameters, joints, serial)
     return ExplicitSystem(
         mass_matrix=mass_matrix,
-        # By derivatives of T instead of M, which would take d times as long.
+        # Uses derivatives of T; derivatives of M would take d times as long.
         forces=functools.partial(
             lagrangian.inverse_dynamics, lambda q, qd: minus_potential(kinetic(q, qd), potential, q)
         ),
@@ -260,8 +261,8 @@ def torque_covariance(
 ) -> Float[Array, "Nd Nd"]:
     """Returns cov(tau(state), tau(other)), (N m)², for all pairs of N states; the joints of a state are adjacent.
 
-    Every state is paired with the N/2 that follow it, cyclically; the other pairs are transposes of these. Blocks of
-    rows are computed in turn; derivatives recompute them, because their intermediate values exceed the caches.
+    Every state is paired cyclically with the next N/2 states; the other pairs are transposes of these. Blocks of rows
+    are computed in turn; derivatives recompute them, because their intermediate values exceed the caches.
     """
     N, d = np.shape(states[0])
     arrays, width = [jnp.asarray(array) for array in states], N // 2 + 1
@@ -289,7 +290,7 @@ def _block(
     """Returns the covariance of states x [d, R, 1] with y [d, R, K]; pairs are the last axes, for long inner loops.
 
     It carries inner products of P = (P_1 .. P_d, v) and Q = (Q_1 .. Q_d, dv/dt) as four arrays [d + 1, d + 1, R, K]:
-    <P, P'>, <P, Q'>, <Q, P'> and <Q, Q'>, where primes are those of y.
+    <P, P'>, <P, Q'>, <Q, P'> and <Q, Q'>, with primes for y.
     """
     d, dtype = len(joints), x[0].dtype
     nothing = jnp.zeros((d + 1, d + 1, *np.broadcast_shapes(x[0].shape[1:], y[0].shape[1:])), dtype)
@@ -335,7 +336,7 @@ def _factors(
     factor: Callable[..., Factor], joints: tuple[JointKind, ...], pairs: Any, x: Array, y: Array
 ) -> tuple[Array, ...]:
     factors = [factor(kind, pairs[joint], x[joint], y[joint]) for joint, kind in enumerate(joints)]
-    # Derivatives for a prismatic joint do not vary along both axes.
+    # The derivatives for a prismatic joint vary along one axis only.
     return jax.tree.map(lambda *leaves: jnp.stack(jnp.broadcast_arrays(*leaves, x[0] + y[0])[:-1]), *factors)
 
 

@@ -11,8 +11,8 @@ networks have four layers, the hidden ones residual:
     h = g(W_1 x + b_1),   h <- h + g(W_k h + b_k) for k = 2, 3,   output = W_4 h + b_4
 
 The rates come from an energy of one coordinate, or from a network: any `Model`. The unit of latent time is a frame. The
-networks see numbers divided by their typical size. Images enter as their principal components, which are fewer numbers
-with nearly the same distances, up to the lost variance,
+networks see numbers divided by their typical size. Images enter as their principal components: fewer numbers with the
+same distances, up to the lost variance,
 
     c = B (x - mean),   x_hat = mean + Bᵀ c,   rows of B [C, n]: the eigenvectors of the covariance, largest first
 """
@@ -44,7 +44,7 @@ LAYERS = 4
 MOST_NUMBERS = 10**8
 """Largest number of entries in the basis of principal components."""
 Field = Literal["black-box-hnn", "phase-network"]
-"""Dynamics of the latent plane: from an energy, or from a network for the rates."""
+"""Kind of latent dynamics: from an energy, or from a network for the rates."""
 
 Latent = Float[Array, "1"]
 
@@ -69,7 +69,7 @@ class ImageModel(NamedTuple):
     images: Callable[[Any], LatentPhase]
     """Parameters -> functions of two successive images [2 n]."""
     coefficients: Callable[[Any, float | Array], LatentPhase]
-    """(parameters of the networks, scale) -> the same of the images' coefficients [2 C], for the training."""
+    """(parameters of the networks, scale) -> functions of the images' coefficients [2 C], for training."""
     field: Model
     """Model of the latent dynamics; its parameters are those of the network "field"."""
 
@@ -104,7 +104,7 @@ def make_image_model(
         raise InputError(f"{components} components of {pixels} pixels are more than {MOST_NUMBERS:,} numbers")
     require_network(width=width, depth=2)
     size: dict[str, Any] = {"width": field_width, "depth": field_depth, "activation": field_activation}
-    # Explicit, so that a change of their defaults does not change stored models.
+    # Explicit values: a change of the defaults must not change stored models.
     size |= {"momentum_scale": 1.0, "dtype": dtype}
     has_energy = field == "black-box-hnn"
     unit = (

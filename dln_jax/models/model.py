@@ -1,20 +1,20 @@
-"""The type of all models (parameters, and the energies that they define), and deep Lagrangian networks.
+"""The type of all models (parameters and energies), and deep Lagrangian networks.
 
     structured:  L = ½ qdᵀ M(q) qd - V(q),  M = L(q) L(q)ᵀ,  diag L = softplus(x + shift) + floor
     black-box:   L = network([features(q), qd / rate_scale])
 
 The structured model (Lutter, Ritter and Peters 2019, "Deep Lagrangian Networks") has a network for the Cholesky factor
-of the mass matrix and another for the potential. Terms that the scene lacks are not built: no potential network without
+of the mass matrix and another for the potential. Only the terms of the scene are built: no potential network without
 gravity, no dissipation without friction, no cos and sin for prismatic joints.
 
 The black-box model (Lutter and Peters 2021, "Combining physics and deep learning to learn continuous-time dynamics
 models", section on black-box models) has no structure. Its mass matrix d²L/dqd² is symmetric but may be indefinite:
 `metrics.errors` reports where it is.
 
-Factories share these keywords: `width` hidden units in each of the `depth` hidden layers of the model's networks; their
-`activation`, which must be smooth if forces are derivatives of an energy; the `dtype` of the parameters. `needs`
-describes the scene and decides features and terms. Factories raise InputError for a width, depth or scale that is not
-positive, and for scales that are neither one number nor one per coordinate.
+All factories take these keywords. Networks have `depth` hidden layers of `width` units. Their `activation` must be
+smooth if forces are derivatives of an energy. `dtype` is the type of the parameters. `needs` describes the scene and
+decides features and terms. Factories raise InputError if a width, depth or scale is not positive, or if a scale is
+neither one number nor one per coordinate.
 """
 
 import inspect
@@ -51,7 +51,17 @@ class Model(NamedTuple):
     """Energies with parameters, as a pair of pure functions.
 
     `energies` closes over the parameters, so a trained model and a textbook system have the same type and run through
-    the same mechanics: `mechanics.equations.dynamics(model.energies(parameters))`.
+    the same mechanics: `dynamics(model.energies(parameters))`. Write your own with any network library; a Haiku
+    transform fits as it is.
+
+    Example:
+        >>> import jax
+        >>> import dln_jax
+        >>> def energies(m):
+        ...     return dln_jax.LagrangianSystem(lambda q, qd: 0.5 * m["mass"] * qd @ qd)
+        >>> cart = dln_jax.Model(lambda key: {"mass": jax.random.uniform(key, (), minval=1.0, maxval=2.0)}, energies)
+        >>> print(dln_jax.dynamics(cart.energies({"mass": 3.0})).inverse_dynamics([0.0], [0.0], [2.0]))
+        [6.]
     """
 
     init: Callable[[Array], Parameters]
@@ -78,13 +88,32 @@ def make_delan(
     shared_trunk: bool = False,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """Returns the (init, energies) pair of a structured DeLaN.
+    """Returns a deep Lagrangian network with structure (Lutter, Ritter and Peters 2019).
+
+    L(q, qd) = ½ qdᵀ M(q) qd - V(q), with M = L Lᵀ. One network has the entries of the Cholesky factor L as outputs,
+    another the potential V. Revolute joints enter as cos and sin.
 
     Args:
+        needs: joints and terms of the system. The model has no potential without gravity, and no dissipation without
+            friction.
+        width: units of each hidden layer.
+        depth: number of hidden layers.
+        activation: name or function; it must be smooth, because forces are derivatives of the networks.
         diagonal_shift: added to the pre-activation of L's diagonal; sets the initial diagonal.
         diagonal_floor: smallest diagonal element of L, in the square root of the unit of M; keeps M regular.
-        shared_trunk: whether factor and potential are outputs of one network instead of two.
-        needs, width, depth, activation, dtype: as described in `models.model`.
+        shared_trunk: use one network for factor and potential instead of two.
+        dtype: type of the parameters.
+
+    Raises:
+        InputError: width or depth is not positive, or the activation is unknown.
+
+    Example:
+        >>> import jax
+        >>> import dln_jax
+        >>> model = dln_jax.make_delan(dln_jax.Needs(joints=("revolute", "revolute")), width=16)
+        >>> arm = dln_jax.dynamics(model.energies(model.init(jax.random.key(0))))
+        >>> print(arm.inverse_dynamics([0.3, 1.2], [0.5, -1.0], [2.0, 0.1]).shape)
+        (2,)
     """
     networks = perceptrons(width, depth, activation)
     terms = partial(
@@ -118,12 +147,12 @@ def make_black_box_lagrangian(
 def model_of(
     record: Callable[..., Any], terms: Callable[[], Mapping[str, Callable[..., Any] | None]], needs: Needs, dtype: Any
 ) -> Model:
-    """Returns the model whose energies are `record(**terms)`.
+    """Returns a model with the energies `record(**terms)`.
 
     Args:
-        record: takes functions of one state as keywords; absent terms are not passed.
-        terms: builds Haiku modules and returns functions that use them, by name; `None` for absent terms.
-        needs: needs of the scene. Parameters are initialised at the arguments (0, 1, ..), where no two bodies coincide.
+        record: takes functions of one state as keywords; absent terms are omitted.
+        terms: builds Haiku modules and returns functions of them by name; `None` for absent terms.
+        needs: needs of the scene. Parameters are initialised at q = (0, 1, ..), where no two bodies coincide.
     """
     d = needs.degrees_of_freedom
 
@@ -175,9 +204,9 @@ def perceptrons(width: int, depth: int, activation: Activation | str) -> Callabl
 
 
 def joint_features(needs: Needs, q: Vector) -> Float[Array, " features"]:
-    """Returns cos and sin of revolute joints, so that a full turn changes nothing; prismatic joints enter directly.
+    """Returns cos and sin of revolute joints, which are periodic, and prismatic displacements unchanged.
 
-    A kind of joint that the scene lacks adds no operation.
+    Only the kinds of joints in the scene add operations.
     """
     revolute = np.array([joint == "revolute" for joint in needs.joints])
     angles = q[np.flatnonzero(revolute)]
@@ -193,7 +222,7 @@ def inputs_of(needs: Needs, q: Vector, *scaled: tuple[Vector, tuple[float, ...]]
 
 
 def unsaturated(x: Float[Array, " inputs"]) -> Float[Array, " inputs"]:
-    """Returns x with NaN in place of infinities: a saturated network would make a plausible number of them."""
+    """Returns x with NaN in place of infinities: a saturated network would return a plausible number for them."""
     return x + 0 * x
 
 

@@ -1,9 +1,9 @@
-"""A rigid tree and a small network for the torque that the tree does not explain.
+"""A rigid tree, and small networks for the torque that the tree does not explain.
 
     V = Σ_j s_j v_j(q),   D = Σ_j s_j r_j d_j(q, qd),   L = diag(√(s / a)) (lower triangle)(q)
 
-v, d, L are outputs of networks; s_j, r_j, a_j are typical sizes of the unexplained torque, of rates and of
-accelerations. The networks' outputs start small, so that training starts at the tree.
+v, d and L are outputs of networks; s_j, r_j and a_j are typical sizes of the unexplained torque, the rates and the
+accelerations. The networks start with small outputs, so training starts at the tree.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ START = 0.1
 
 
 class ResidualParameters(NamedTuple):
-    """Parameters of a rigid tree and of its residual."""
+    """Parameters of a rigid tree and its residual networks."""
 
     rigid: Any
     residual: Parameters

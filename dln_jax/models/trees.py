@@ -1,10 +1,10 @@
-"""Trees of rigid bodies: their inertias, armature and friction, and frames that are not known, are the parameters.
+"""Trees of rigid bodies with inertias, armature, friction and, if unknown, frames as parameters.
 
 With known frames forces are linear in these parameters, so `learning.linear.fit_linear(..., negligible=1e-12)`
 identifies all at once. Data determine only combinations of the eleven numbers per joint ("base parameters"). A fit
-returns the shortest solution that predicts the same forces, which need not be physically consistent.
+returns the solution of least norm, which need not be physically consistent.
 
-Forces are not linear in the shape of friction, the share of load and the cooling coefficient, which are fixed when the
+Forces are not linear in the friction shapes, the load coefficient and the cooling coefficient. These are fixed when the
 model is built; `learning.friction.fit_friction` fits them. Viscous friction of warm grease is lower:
 
     b(T) = b exp(-k (T - T_ref))
@@ -12,8 +12,8 @@ model is built; `learning.friction.fit_friction` fits them. Viscous friction of 
 For motors that turn with several joints, and armature as a matrix, see `mechanics.trees.motors`.
 
 In an arm with unknown kinematics the joint frames are parameters too (`make_serial_tree`). Links form a tree in a given
-order, a serial chain by default. Torques do not identify all six numbers of a frame. The
-directions without effect ("gauges") are
+order, a serial chain by default. Torques do not identify all six numbers of a frame. These changes have no effect
+("gauges"):
 
 - rotating a link's frame about its joint's axis, or sliding it along the axis, together with the link's inertia and the
   next frames: an axis in space has four numbers, the direction of a prismatic joint two;
@@ -66,7 +66,7 @@ class RigidTreeParameters(NamedTuple):
     armature: Any
     """[d], kg m² or kg."""
     viscous: Any = None
-    """[d], like the coefficients below, as in `FrictionCoefficients`."""
+    """[d], as in `FrictionCoefficients`, like the coefficients below."""
     coulomb: Any = None
     offset: Any = None
     stribeck: Any = None
@@ -103,20 +103,21 @@ def make_rigid_tree(
     """Returns a model with the frames of a tree.
 
     Args:
-        tree: its inertias and armature are the initial parameters; friction is initially zero.
-        friction: laws whose coefficients are also parameters, as in `mechanics.friction`; True: `USUAL`.
+        tree: its inertias and armature are the initial parameters; friction starts at zero.
+        friction: friction laws (`mechanics.friction`) with coefficients as parameters; True: `USUAL`.
         velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift: as in `FrictionShape`; they are not fitted.
-        load: share of the load law, 0 <= μ < 1; not fitted. With it, forces are not linear in the parameters.
+        load: coefficient of the load law, 0 <= μ < 1; not fitted. Forces are then not linear in the parameters.
         cooling: k, 1/K; not fitted.
         reference_temperature: T_ref of the viscous coefficients, °C.
-        temperature: T, °C, of all functions (default: T_ref). `energies(parameters, T)` takes another, also per joint.
+        temperature: T, °C, of all functions (default: T_ref). `energies(parameters, T)` takes another value, also per
+            joint.
         motors: rows of S in motor rates S qd; armature and friction act on the motors. By default one per joint.
         coupled: pairs of motors, counted from 0, with an off-diagonal entry of the armature, which is a parameter.
 
     Raises:
-        InputError: a law is unknown, two laws describe the same friction, a velocity or slope is not positive, a share
-            is outside [0, 1) or lacks its law, cooling lacks viscous friction, motors do not determine the joints'
-            rates, or the tree's armature is impossible with these motors.
+        InputError: a law is unknown, two laws describe the same friction, a velocity or slope is not positive, a load
+            coefficient is outside [0, 1) or lacks its law, cooling lacks viscous friction, motors do not determine the
+            joints' rates, or the tree's armature is impossible with these motors.
     """
     laws = USUAL if friction is True else friction or ()
     require_laws(laws, "friction")
@@ -125,7 +126,7 @@ def make_rigid_tree(
     require_shape(shape)
     shares = np.ravel(load)
     if not all(0 <= share < 1 for share in shares):
-        raise InputError(f"load is {load}; expected a share of at least 0 and less than 1, or one for each joint")
+        raise InputError(f"load is {load}; expected a coefficient of at least 0 and below 1, or one for each joint")
     if any(shares) and "load" not in laws:
         raise InputError(f"load is {load}, but friction has {', '.join(laws) or 'no law'}; add 'load' to friction")
     d = tree.degrees_of_freedom
@@ -190,11 +191,11 @@ def make_serial_tree(
     velocity_scale: float = 0.01,
     dtype: DTypeLike = jnp.float64,
 ) -> Model:
-    """Returns a tree of the needed joints whose frames are parameters.
+    """Returns a tree with the needed joints and with frames as parameters.
 
     Args:
         needs: kinds of joints, gravity and friction (viscous, dry and an offset in every joint).
-        parents: parent link of every link, -1 for the ground; by default the one before.
+        parents: parent link of every link, -1 for the ground; by default the previous link.
         acceleration: acceleration of gravity, m/s².
         velocity_scale: velocity scale of dry friction, as for `mechanics.friction.joint_dissipation`; it is not fitted.
 
@@ -218,7 +219,7 @@ def make_serial_tree(
         len(parents) != d or any(not -1 <= parent < link for link, parent in enumerate(parents))
     ):
         raise InputError(
-            f"parents are {tuple(parents)}; expected for each of {d} links one before it, or -1 for the ground"
+            f"parents are {tuple(parents)}; expected an earlier link for each of {d} links, or -1 for the ground"
         )
 
     def init(key: Array) -> SerialTreeParameters:
@@ -243,7 +244,7 @@ def tree_of(
     parents: Sequence[int] | None = None,
     acceleration: float = 9.81,
 ) -> Tree:
-    """Returns the tree of these parameters, like one with known frames; other arguments as for `make_serial_tree`."""
+    """Returns the tree with these parameters; other arguments as for `make_serial_tree`."""
     d = needs.degrees_of_freedom
     return Tree(
         parents=tuple(range(-1, d - 1)) if parents is None else tuple(parents),

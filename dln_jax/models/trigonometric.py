@@ -7,11 +7,11 @@ The basis b is the product over joints of {1, cos q, .., cos nq, sin q, .., sin 
 
     tau = M qdd + dM/dt qd - ½ d(qdᵀ M qd)/dq + dV/dq + friction * qd
 
-is linear in all parameters, so a linear least-squares problem identifies them (`learning.linear`), as Atkeson, An and
-Hollerbach (1986, "Estimation of inertial parameters of manipulator loads and links") did for rigid bodies.
+is linear in all parameters, so linear least squares identifies them (`learning.linear`), as Atkeson, An and Hollerbach
+(1986, "Estimation of inertial parameters of manipulator loads and links") did for rigid bodies.
 
 Rigid links on revolute joints need degree 1 in every angle for V; M needs degree 1 if the chain is planar and 2
-otherwise. The form does not make M positive definite, only the data do; a singular M gives non-finite accelerations.
+otherwise. The form does not ensure a positive definite M; a singular M gives non-finite accelerations.
 
 A planar chain on a fixed base, or on one or more slides, needs fewer parameters (`make_planar_chain`). With the links'
 absolute angles phi, measured from hanging straight down,
@@ -23,7 +23,7 @@ absolute angles phi, measured from hanging straight down,
 A is symmetric and B skew. B and h vanish if every centre of mass lies on the line between its joints and the angles are
 zero at rest; A_11 includes the armature a_1 of the first motor. All parameters enter linearly
 (`learning.linear.fit_linear`), and motions identify all of them ("base parameters"): for a double pendulum, g_2 / A_12
-is the acceleration of gravity divided by the length of the first link. Friction acts in the joints, whatever the
+is the acceleration of gravity divided by the length of the first link. Friction acts in the joints for both kinds of
 coordinates.
 
 Slides come before all hinges and have phi = 0; in T, the rate of their displacement x takes the place of phid. A_ij and
@@ -49,19 +49,19 @@ from dln_jax.models.model import Model
 from dln_jax.types import InputError, JointKind, Matrix, Needs, Scalar, Vector, require_positive
 
 MOST_COEFFICIENTS = 20_000
-"""Largest number of coefficients of the mass matrix. The number grows exponentially with the joints, and the cost of a
-fit with its square."""
+"""Largest number of coefficients of the mass matrix. This number grows exponentially with the joints, and the cost of a
+fit grows with its square."""
 SPRING_DEGREE = 2
 """Lower bound on the degree of the potential in a prismatic displacement, so that it includes a linear spring."""
 
 
 class TrigonometricParameters(NamedTuple):
-    """Coefficients of the basis functions; `None` for a term that the scene lacks."""
+    """Coefficients of the basis functions; `None` for absent terms."""
 
     mass: Array
     """m: lower triangle of M, row by row, times the basis, [d (d + 1) / 2, B]; kg m², kg m or kg."""
     potential: Array | None
-    """v [B_V - 1], in J, without the constant, which no motion shows."""
+    """v [B_V - 1], in J, without the constant, which has no effect."""
     friction: Array | None
     """Viscous friction [d], in N m s or N s/m."""
 
@@ -206,9 +206,9 @@ def make_planar_chain(
     Args:
         needs: prismatic joints come first; friction adds viscous and dry friction in all joints.
         coordinates: "relative" or "absolute": q_i is the angle of link i from the previous link, or from the vertical.
-        directions: 1 or -1 for every joint: -1 if its axis points against that of the first (default: all 1).
-        symmetric: whether B and h are left out.
-        armature: whether the hinges after the first have armature (the inertia of motors or gears).
+        directions: 1 or -1 for every joint: -1 if its axis is opposite to the first joint's (default: all 1).
+        symmetric: leave out B and h.
+        armature: the hinges after the first have armature (the inertia of motors or gears).
         velocity_scale: velocity scale of dry friction, rad/s, as in `FrictionShape`; it is not fitted.
 
     Raises:
@@ -219,7 +219,7 @@ def make_planar_chain(
     d = needs.degrees_of_freedom
     hinge = np.array([joint == "revolute" for joint in needs.joints])
     if (np.diff(hinge.astype(int)) < 0).any():
-        raise InputError(f"the joints are {needs.joints}; a planar chain has slides before hinges: take another model")
+        raise InputError(f"the joints are {needs.joints}; a planar chain has slides before hinges: use another model")
     if coordinates not in ("relative", "absolute"):
         raise InputError(f"coordinates are {coordinates!r}; expected 'relative' or 'absolute'")
     signs = np.ones(d) if directions is None else np.asarray(directions)

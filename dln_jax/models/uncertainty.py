@@ -1,4 +1,4 @@
-"""Uncertainty of a fitted model: the standard deviation of its torque at any state, and an out-of-distribution test.
+"""Uncertainty of a fitted model: a standard deviation of the torque at any state, and an out-of-distribution test.
 
 Fitted parameters theta have the covariance Cov(theta) = F Fᵀ. To first order (exactly, if forces are linear in them)
 the torque of joint i at a state has the standard deviation
@@ -6,7 +6,8 @@ the torque of joint i at a state has the standard deviation
     sd_i² = noise_i² + inflation_i |phi_i F|²,   phi_i = d tau_i / d theta
 
 (MacKay 1992, "A practical Bayesian framework for backpropagation networks"; Immer et al. 2021, "Improving predictions
-of Bayesian neural nets via local linearization"). `learning.uncertainty` estimates these. Functions take one state.
+of Bayesian neural nets via local linearization"). `learning.uncertainty` estimates the covariance, noise and inflation.
+Functions take one state.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,7 +24,7 @@ from dln_jax.models.model import Model, Parameters, linearised
 from dln_jax.types import Vector
 
 UNDETERMINED = 1e-3
-"""Largest accepted share of |phi|, in scaled parameters, along directions that the data left undetermined."""
+"""Largest accepted share of |phi|, in scaled parameters, along directions that the data do not determine."""
 
 
 class Domain(NamedTuple):
@@ -32,17 +33,17 @@ class Domain(NamedTuple):
     limit: Any
     """[d], bound on |phi F| over the data, N m or N."""
     scale: Any
-    """[P], sizes of the columns of Phi over the data; 1 for columns that are zero there."""
+    """[P], sizes of the columns of Phi over the data; 1 for zero columns."""
     undetermined: Any
-    """[P, P - rank], orthonormal directions of scaled parameters that the data leave undetermined; empty for networks,
-    whose prior determines them."""
+    """[P, P - rank], orthonormal directions of scaled parameters that the data do not determine; empty for networks,
+    which have a prior."""
     centre: Any
     """[3 d], middle of the range of (q, qd, qdd)."""
     reach: Any
-    """[3 d], distances from the middle that the data reach."""
+    """[3 d], largest distances of the data from the middle."""
     harmless: Any
-    """[d], N m or N; with |phi F| below this a state may leave the range of the data. Zeros for networks, whose
-    covariance alone cannot be trusted there."""
+    """[d], N m or N: while |phi F| is below it, a state may leave the range of the data. Zero for networks: their
+    covariance alone is not reliable there."""
 
 
 class Uncertainty(NamedTuple):
@@ -51,9 +52,9 @@ class Uncertainty(NamedTuple):
     factor: Any
     """F [P, K]."""
     noise: Any
-    """[d], standard deviation that no parameters explain, N m or N."""
+    """[d], standard deviation of the noise, N m or N."""
     inflation: Any
-    """[d], factor on the variance due to parameters; 1 if errors are independent."""
+    """[d], factor on the variance of the parameters; 1 if errors are independent."""
     domain: Domain
 
 
@@ -61,9 +62,9 @@ class Scores(NamedTuple):
     """Scores of a state; a state with a score above 1 is out of distribution."""
 
     parameters: Array
-    """[], standard deviation due to parameters, relative to that on the data; the maximum over joints."""
+    """[], standard deviation due to parameters, relative to its bound on the data; the maximum over joints."""
     undetermined: Array
-    """[], share of Phi along directions that the data leave undetermined, relative to `UNDETERMINED`."""
+    """[], share of Phi along directions that the data do not determine, relative to `UNDETERMINED`."""
     distance: Array
     """[], distance from the middle of the range of (q, qd, qdd), relative to its reach; the maximum over coordinates. 0
     if the deviation due to parameters is below `Domain.harmless` in all joints."""
@@ -75,7 +76,7 @@ def predictive(
     """Returns (q, qd, qdd) -> standard deviation of the torque [d] at one state, N m or N.
 
     Args:
-        factor: F [P, K] of their covariance, in the order of `ravel_pytree(parameters)`.
+        factor: F [P, K] of the covariance of the parameters, in the order of `ravel_pytree(parameters)`.
         noise: standard deviation of one measurement [d]; zero for the deviation of the model's own torque.
         inflation: factor on the variance due to parameters, [d].
     """

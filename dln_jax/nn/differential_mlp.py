@@ -16,8 +16,8 @@ and the derivatives with respect to x follow from g' and g'' of the activation:
 A backward sweep costs one pass per output, a forward sweep one per input or pair of inputs. `cheaper_jacobian` and
 `cheaper_hessian` count floating point operations, and the shapes decide before anything is compiled.
 
-One state, no batch axis: `jax.vmap` over x. The layers of an ensemble have a leading axis of members. In the code the n
-inputs are the first axis of J [n, width], so that a batch of Jacobians and a weight form one matrix product.
+One state, no batch axis: `jax.vmap` over x. The layers of an ensemble have a leading axis of members. The code stores J
+as [n, width], so a batch of Jacobians and a weight form one matrix product.
 """
 
 from collections.abc import Callable, Sequence
@@ -66,7 +66,7 @@ def init(
 
 
 def init_ensemble(key: PRNGKeyArray | Array, sizes: Sequence[int], *, members: int, **schemes: Any) -> Layers:
-    """`init` for as many keys as there are members: weights [members, in, out], biases [members, out]."""
+    """Applies `init` to one key per member: weights [members, in, out], biases [members, out]."""
     return jax.vmap(partial(init, sizes=sizes, **schemes))(jax.random.split(key, members))
 
 
@@ -78,14 +78,14 @@ def layer_shapes(sizes: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def value(layers: Layers, x: Array, *, activation: Activation) -> Float[Array, "m"]:
-    """y [m] at x [n]. Raises InputError if x or the layers have the wrong shape."""
+    """Returns y [m] at x [n]. Raises InputError if x or the layers have the wrong shape."""
     return _forward(layers, x, activation)[2]
 
 
 def value_and_jacobian(
     layers: Layers, x: Array, *, activation: Activation
 ) -> tuple[Float[Array, "m"], Float[Array, "m n"]]:
-    """y [m] and dy/dx [m, n] at x [n]. Raises InputError if x or the layers have the wrong shape."""
+    """Returns y [m] and dy/dx [m, n] at x [n]. Raises InputError if x or the layers have the wrong shape."""
     sizes, preactivations, y = _forward(layers, x, activation)
     if cheaper_jacobian(sizes) == "backward":
         jacobian = _each_output(lambda adjoint: _gradient(layers, preactivations, adjoint, activation), layers[-1][0])
@@ -97,7 +97,7 @@ def value_and_jacobian(
 def value_and_pull_back(
     layers: Layers, x: Array, *, activation: Activation
 ) -> tuple[Float[Array, "m"], Callable[[Array], Float[Array, "n"]]]:
-    """y [m] at x [n], and w [m] -> (dy/dx)ᵀ w [n] by one backward sweep for all outputs. Raises as `value`."""
+    """Returns y [m] at x [n], and w [m] -> (dy/dx)ᵀ w [n] by one backward sweep. Raises InputError as `value`."""
     _, preactivations, y = _forward(layers, x, activation)
     return y, lambda w: _gradient(layers, preactivations, layers[-1][0] @ w, activation)
 
@@ -105,7 +105,7 @@ def value_and_pull_back(
 def value_jacobian_and_hessian(
     layers: Layers, x: Array, *, activation: Activation
 ) -> tuple[Float[Array, "m"], Float[Array, "m n"], Float[Array, "m n n"]]:
-    """y [m], dy/dx [m, n] and d²y/dx² [m, n, n] at x [n]. Raises InputError if a shape is wrong."""
+    """Returns y [m], dy/dx [m, n] and d²y/dx² [m, n, n] at x [n]. Raises InputError if a shape is wrong."""
     sizes, preactivations, y = _forward(layers, x, activation)
     backward = cheaper_hessian(sizes) == "backward"
     derivatives = _derivatives_by_two_sweeps if backward else _derivatives_by_forward_sweep
@@ -113,7 +113,7 @@ def value_jacobian_and_hessian(
 
 
 def mean_and_spread(network: Callable[[Layers, Array], Any], layers: Layers, x: Array) -> tuple[Any, Any]:
-    """Mean and spread over K members at x [n] of all outputs of `network(layers, x)`.
+    """Returns mean and spread over K members of all outputs of `network(layers, x)` at x [n].
 
     The spread is the sample standard deviation (the sum of squares over K - 1).
 
@@ -121,18 +121,18 @@ def mean_and_spread(network: Callable[[Layers, Array], Any], layers: Layers, x: 
     `partial(value_jacobian_and_hessian, activation=tanh)` for the statistics of value, Jacobian and
     Hessian. The arrays of `layers` have a leading axis of members, as from `init_ensemble`.
 
-    Raises InputError for fewer than two members, which have no spread.
+    Raises InputError for fewer than two members.
     """
     members = layers[0][0].shape[0]
     if members < 2:
-        raise InputError(f"the ensemble has {members} member; its spread needs two or more")
+        raise InputError(f"the ensemble has {members} member; a spread needs at least 2")
     outputs = jax.vmap(network, in_axes=(0, None))(layers, x)
     mean, spread = partial(jnp.mean, axis=0), partial(jnp.std, axis=0, ddof=1)
     return jax.tree.map(mean, outputs), jax.tree.map(spread, outputs)
 
 
 def cheaper_jacobian(sizes: Sequence[int]) -> Sweep:
-    """Sweep with fewer operations for the Jacobian of a network with `sizes` (n, width, ..., m)."""
+    """Returns the sweep with fewer operations for the Jacobian of a network with `sizes` (n, width, ..., m)."""
     inputs, *widths, outputs = sizes
     if not widths:
         return "forward"
@@ -143,10 +143,11 @@ def cheaper_jacobian(sizes: Sequence[int]) -> Sweep:
 
 
 def cheaper_hessian(sizes: Sequence[int]) -> Sweep:
-    """Sweep with fewer operations for Jacobian and Hessian, without the J_l that both sweeps need.
+    """Returns the sweep with fewer operations for Jacobian and Hessian, not counting J_l, which both need.
 
-    Counted in multiply-adds. Backward, per output: the adjoint, then per layer n columns to scale and n² products of a
-    width. Forward, per pair of inputs: the weights after the first, then three operations per hidden unit.
+    It counts multiply-adds. A backward sweep takes, per output, the adjoint, and per layer n scaled columns and n²
+    products of a width. A forward sweep takes, per pair of inputs, the weights after the first layer and three
+    operations per hidden unit.
     """
     inputs, *widths, outputs = sizes
     if not widths:
@@ -159,13 +160,13 @@ def cheaper_hessian(sizes: Sequence[int]) -> Sweep:
 
 
 def _check(layers: Layers, x: Array) -> tuple[int, ...]:
-    """Returns sizes (n, width, ..., m); InputError if the layers do not chain or x is not one state of n numbers."""
+    """Returns sizes (n, width, ..., m); InputError if the layers do not fit together or x is not one state [n]."""
     shapes = [(weight.shape, bias.shape) for weight, bias in layers]
     chained = bool(shapes) and all(len(weight) == 2 and bias == weight[1:] for weight, bias in shapes)
     if not chained or any(left[1] != right[0] for (left, _), (right, _) in pairwise(shapes)):
         raise InputError(
-            f"layers have (weight, bias) shapes {shapes}; expected one network, weight [in, out] and bias [out] with "
-            "each in equal to the out before it. Members of an ensemble need jax.vmap, as in mean_and_spread"
+            f"layers have (weight, bias) shapes {shapes}; expected one network with weight [in, out] and bias [out], "
+            "each in equal to the previous out. Use jax.vmap for an ensemble, as in mean_and_spread"
         )
     sizes = (shapes[0][0][0], *(weight[1] for weight, _ in shapes))
     if x.shape != sizes[:1]:
@@ -185,7 +186,7 @@ def _forward(layers: Layers, x: Array, activation: Activation) -> tuple[tuple[in
 
 
 def _input_jacobians(layers: Layers, preactivations: list[Array], activation: Activation) -> list[Array]:
-    """J_l [n, width] for the layers of these preactivations, hidden ones and then the output."""
+    """Returns J_l [n, width] of the hidden layers with these preactivations, and of the output."""
     jacobians = [layers[0][0]]
     for preactivation, (weight, _) in zip(preactivations, layers[1:], strict=False):
         jacobians.append((activation.first(preactivation) * jacobians[-1]) @ weight)
@@ -193,8 +194,8 @@ def _input_jacobians(layers: Layers, preactivations: list[Array], activation: Ac
 
 
 def _each_output(function, weight: Array):
-    """function(weight[:, k]) for all outputs k, stacked. A single output is computed without the axis, because XLA's
-    sums over an axis of length 1 are slow."""
+    """Returns function(weight[:, k]), stacked over the outputs k. A single output is computed without the axis, because
+    XLA's sums over an axis of length 1 are slow."""
     if weight.shape[1] == 1:
         return jax.tree.map(lambda leaf: leaf[None], function(weight[:, 0]))
     return jax.vmap(function, in_axes=1)(weight)
@@ -228,7 +229,7 @@ def _derivatives_by_two_sweeps(
 ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
     jacobians = _input_jacobians(layers[:-1], preactivations, activation)
     inputs, width = jacobians[0].shape
-    # J_1 = W_1 is the same for all states of a batch: with its products formed first, the term is one matrix product.
+    # J_1 = W_1 is the same for all states of a batch. With its products formed first, the term is one matrix product.
     first_products = (jacobians[0][:, None] * jacobians[0]).reshape(inputs * inputs, width)
 
     def sweep(adjoint: Array) -> tuple[Array, Array]:

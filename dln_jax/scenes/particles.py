@@ -28,7 +28,7 @@ def mass_spring(*, mass: float = 1.0, stiffness: float = 1.0, friction: float = 
 
 
 def henon_heiles(*, coupling: float = 1.0, friction: float = 0.0) -> Scene:
-    """The Hénon-Heiles system, whose orbits are regular or chaotic depending on their energy.
+    """The Hénon-Heiles system, with regular or chaotic orbits depending on the energy.
 
         H = ½ (p₁² + p₂²) + ½ (x² + y²) + λ (x² y - y³/3)
 
@@ -83,9 +83,9 @@ def n_body(
     if len(per_body) != n:
         raise InputError(f"masses has {len(per_body)} entries; expected one number, or one for each of {n} bodies")
     if not softening >= 0:
-        raise InputError(f"softening is {softening}; expected a length in m, zero for none")
+        raise InputError(f"softening is {softening}; expected a length of at least 0 m")
     first, second = np.triu_indices(n, 1)
-    # Rows subtract one body's position from another's.
+    # Each row subtracts the positions of two bodies.
     difference = np.eye(n)[first] - np.eye(n)[second]
     strength = G * np.array(per_body)[first] * np.array(per_body)[second]
 

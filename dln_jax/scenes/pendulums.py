@@ -1,4 +1,4 @@
-"""Pendulums: a single and a double one, arms of two links, chains of d rods, and poles on a driven base."""
+"""Pendulums: single and double pendulums, two-link arms, chains of d rods, and poles on a driven base."""
 
 from typing import Any, Literal, NamedTuple
 
@@ -60,9 +60,9 @@ def _hanging(
 
     Args:
         coupling: a in M_ij = a_ij cos(θ_i - θ_j), kg m².
-        weight: torque that holds each rod horizontal, with all that it carries, N m.
+        weight: torque that holds each rod horizontal, with everything attached to it, N m.
         lengths: lengths of the rods, m.
-        relative: whether q holds angles between neighbours: θ = S q = cumsum(q), M = Sᵀ M_θ S, and likewise for forces.
+        relative: q holds the angles between neighbours: θ = S q = cumsum(q), M = Sᵀ M_θ S, and likewise for forces.
     """
 
     def same(x: Any) -> Any:
@@ -95,8 +95,8 @@ def _hanging(
 def two_link_arm(*, zero: Literal["horizontal", "hanging"] = "horizontal") -> Scene:
     """The frictionless plant of the published DeLaN experiments (Lutter et al. 2019), with q2 relative to link 1.
 
-    `zero` is the posture at q = 0, which sets the gravity convention: "horizontal" is that of all published data
-    (gravity in cos q), "hanging" that of most textbooks (gravity in sin q).
+    `zero` is the posture at q = 0: "horizontal" as in all published data (gravity in cos q), or "hanging" as in most
+    textbooks (gravity in sin q).
     """
     name = "two-link-arm" if zero == "horizontal" else "two-link-arm-hanging"
     inertias, weights = (1.3727291666666667, 0.5176145833333333, 0.5), (2.625, 1.5)
@@ -116,8 +116,8 @@ def _two_links(
 
     Args:
         inertias: M = [[a + 2 c cos q2, b + c cos q2], [b + c cos q2, b]] with these a, b and c, kg m².
-        weights: torque that holds each link horizontal, N m; that of the first carries the second.
-        hanging: whether both links hang at q = 0, or are horizontal.
+        weights: torque that holds each link horizontal, N m; the first includes the second link.
+        hanging: both links hang at q = 0; otherwise they are horizontal.
         options: friction and actuation, as for `textbook`.
     """
     shoulder_inertia, elbow_inertia, coupling = inertias
@@ -182,7 +182,7 @@ def two_link_pendulum(
 ) -> Scene:
     """The acrobot or the pendubot with q = 0 hanging and q[1] relative to the first link; in m/s² and N m s.
 
-    The default links are those of design C.1, model 1.1, of the benchmark of Wiebe et al. (2022, "RealAIGym").
+    The default links are design C.1, model 1.1, of the benchmark by Wiebe et al. (2022, "RealAIGym").
     """
     (m1, m2), (l1, l2), (r1, r2), (I1, I2) = links
     inertias = I1 + I2 + m2 * l1**2, I2, m2 * l1 * r2
@@ -256,7 +256,7 @@ def flexible_cart_pole(
     """A cart pulls a second one by a spring, q = (driven cart, extension of the spring, pole angle from upright).
 
     The second cart is at q[0] + q[1]; it carries the pole, a point mass at `length` from its hinge. Only the first cart
-    is driven: tau = B f with B = (1, 0, 0)ᵀ. Defaults are those of Lutter et al. (CoRL 2019).
+    is driven: tau = B f with B = (1, 0, 0)ᵀ. Defaults as in Lutter et al. (CoRL 2019).
 
     Args:
         driven_mass: mass of the driven cart, kg.
@@ -311,7 +311,7 @@ def rotary_pendulum(
     """An arm about the vertical carries a free pole, q = (arm angle, pole angle from upright); kg, m, m/s², N m s.
 
     After Furuta et al. (1992). Arm and pole are uniform rods. Only the arm is driven: tau = B u with B = (1, 0)ᵀ. The
-    dimensions are those of a common desktop plant.
+    dimensions are typical of a desktop plant.
     """
     centre = pole_length / 2
     about_hinge = pole_mass * pole_length**2 / 3
@@ -336,7 +336,8 @@ def rotary_pendulum(
 def _driven_pole(
     name: str, base: JointKind, mass_matrix: Any, coriolis: Any, weight: float, tip: Any, friction: float
 ) -> Scene:
-    """Returns a driven base with a free pole, q[1] from upright; its weight is the torque that holds it horizontal."""
+    """Returns a driven base with a free pole, q[1] from upright; `weight` is the torque that holds the pole
+    horizontal."""
 
     def potential(q: Vector) -> Scalar:
         return weight * jnp.cos(q[1])

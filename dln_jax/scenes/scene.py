@@ -15,14 +15,14 @@ from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.types import Dissipation, FrictionLaw, InputError, JointKind, Lagrangian, Needs, Potential, Vector
 
 LAWS: tuple[FrictionLaw, ...] = ("viscous", "coulomb", "stribeck")
-"""Friction laws available for a scene; the others of `mechanics.friction` apply to gears."""
+"""Friction laws available for a scene; the other laws of `mechanics.friction` describe gears."""
 
 
 class Scene(NamedTuple):
     """A textbook mechanical system; symbols and units as in `dln_jax.types`.
 
-    The energies define it. `coriolis` and `gravity` are written by hand, as an independent ground truth for anything
-    derived from the energies.
+    The energies define it. `coriolis` and `gravity` are textbook formulas: an independent ground truth for functions
+    that are derived from the energies.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Scene(NamedTuple):
 
     @property
     def closed_form(self) -> ExplicitSystem:
-        """The energies and hand-written forces, for the functions of `mechanics.explicit`."""
+        """The energies and textbook forces, for the functions of `mechanics.explicit`."""
         return explicit.closed_form(self.mass_matrix, self.coriolis, self.potential, self.gravity, self.dissipation)
 
     @property
@@ -52,7 +52,7 @@ class Scene(NamedTuple):
 
     @property
     def energies(self) -> LagrangianSystem:
-        """The energies in the record that mechanics takes, as for models."""
+        """The energies as a `LagrangianSystem`, for `dynamics` and `flow`."""
         return LagrangianSystem(self.lagrangian, self.dissipation)
 
 
@@ -80,7 +80,7 @@ def textbook(
 
 
 def closed_form_forward_dynamics(scene: Scene, q: Vector, qd: Vector, tau: Vector) -> Vector:
-    """Returns the acceleration qdd [d] by textbook formulas and LAPACK; the last digits of datasets depend on them."""
+    """Returns the acceleration qdd [d] by textbook formulas and LAPACK, on which the last digits of datasets depend."""
     bias = dynamics(scene.closed_form).inverse_dynamics(q, qd, jnp.zeros_like(qd))
     return jnp.linalg.solve(scene.mass_matrix(q), tau - bias)
 
@@ -95,7 +95,7 @@ def with_friction(
     coefficients: FrictionCoefficients,
     shape: FrictionShape = FrictionShape(),  # noqa: B008
 ) -> Scene:
-    """Adds friction to the joints of a scene, in addition to any it already has.
+    """Adds friction to the joints of a scene, on top of existing friction.
 
     Dry friction is c tanh(u / v) with a small v, `shape.velocity_scale`: a joint "at rest" creeps more slowly than v.
     An explicit integrator is stable for steps below about 2.8 m v / c, where m is the smallest inertia at the joint.
@@ -113,7 +113,7 @@ def with_friction(
         raise InputError(f"a scene has no {others[0]} friction; expected some of {', '.join(LAWS)}")
     dissipation = joint_dissipation(**present, **shape._asdict())
     if dissipation is None:
-        raise InputError("there is no friction to add; give a coefficient that is not zero, or take the scene as it is")
+        raise InputError("all friction coefficients are zero; give a non-zero coefficient, or use the scene unchanged")
     laws = tuple(law for law in LAWS if law in present)
     needs = scene.needs._replace(joint_friction=laws)
     return scene._replace(needs=needs, dissipation=sum_of(scene.dissipation, dissipation))

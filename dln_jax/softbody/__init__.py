@@ -2,8 +2,8 @@
 
 `mesh` builds bodies and `terms` their energies. A scene holds both, and `make_step` returns its time step.
 
-SciPy's OpenBLAS, which factorises for JAX on a CPU, is set to one thread unless `OPENBLAS_NUM_THREADS` says otherwise:
-its threads spin while they wait for the small matrices of a step, which took 2 to 50 times the processor time.
+SciPy's OpenBLAS factorises for JAX on a CPU. It is set to one thread unless `OPENBLAS_NUM_THREADS` is set: threads that
+spin between the small matrices of a step took 2 to 50 times the processor time.
 """
 
 import ctypes

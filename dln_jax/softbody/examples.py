@@ -42,13 +42,13 @@ GRAVITY = 9.81
 DENSITY = 1000.0
 """In kg/m³."""
 SLOPE = 0.5
-"""Rise of the slope over its run."""
+"""Rise over run of the slope."""
 CONTACT_FRICTION = 0.3
 """Coulomb's coefficient between bodies."""
 DROP_SPEED = 2.0
 """Initial velocity of the falling body to the right, in m/s."""
 TURNING = 4.0
-"""Time in s over which the bar's ends turn."""
+"""Time in s of turning the bar's ends."""
 WAVE_PERIOD = 0.33
 """Period of the creature's muscles, in s."""
 WAVE_LENGTH = 2.0
@@ -74,11 +74,11 @@ class Example(NamedTuple):
     control: Callable[[np.ndarray], Any] | None = None
     """Times [T] in s -> actuation [T, k], or a dict of such arrays by actuator."""
     held_path: Callable[[np.ndarray], np.ndarray] | None = None
-    """Times [T] in s -> positions of the held vertices [T, k, dim]; by default they stay."""
+    """Times [T] in s -> positions of the held vertices [T, k, dim]; by default fixed."""
     muscles: np.ndarray | None = None
     """Pairs of vertices [k, 2], for figures."""
     moments: tuple[float, ...] = (0.0,)
-    """Times in s that figures show."""
+    """Times in s shown in figures."""
 
 
 def inputs(example: Example, dt: float, steps: int, *, first: int = 0) -> tuple[Any, Motion | None]:
@@ -141,7 +141,7 @@ def twist(
     mixed: bool = False,
     contact: bool = False,
 ) -> Example:
-    """A bar of 1 m x 8 m x 1 m whose ends are twisted about its axis, each by half of `turns`, in opposite directions.
+    """A bar of 1 m x 8 m x 1 m with ends twisted about its axis in opposite directions, each by half of `turns`.
 
     Twisting takes 4 s; then the ends are held for 1 s. There is no gravity. Beyond two turns the bar buckles, and
     without `contact` it can pass through itself.
@@ -221,12 +221,12 @@ def drop(
 
 
 def creature_scene(creature: Creature, bumps: Bumps | None = None) -> SoftScene:
-    """Returns the scene of a preset creature above its ground, which is rough with `bumps`."""
+    """Returns the scene of a preset creature above flat ground, or rough ground with `bumps`."""
     return make_scene(creature.mesh, creature_terms(creature.mesh, creature.muscles, bumps=bumps), masses=MASS)
 
 
 def creature() -> Example:
-    """The crawler, whose muscles shorten in a wave from head to tail that pushes it forwards."""
+    """The crawler: a wave of shortening muscles from head to tail pushes it forwards."""
     body = crawler()
     scene = creature_scene(body)
     x, y = body.mesh.vertices[body.muscles].mean(axis=1).T
@@ -266,7 +266,7 @@ def _solid(
 
 
 def _ground(mesh: Mesh, friction: float, *, height: float, normal: np.ndarray) -> Term:
-    """A plane so stiff that one vertex carrying the whole weight sinks by a thousandth of the body's height."""
+    """A stiff plane: one vertex with the whole weight sinks by a thousandth of the body's height."""
     stiffness = 1e3 * (GRAVITY * float(lumped_masses(mesh, DENSITY).sum())) / height
     every = np.arange(len(mesh.vertices))
     return plane_contact(every, normal=normal, stiffness=stiffness, width=1e-3 * height, friction=friction)

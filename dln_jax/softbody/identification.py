@@ -3,8 +3,8 @@
     minimise over theta:  mean over motions of |x(t; theta) - x_observed(t)|² / noise²        (identification)
     minimise over theta:  |x*(theta) - x_wanted|² / noise²,   x* an equilibrium               (inverse design)
 
-Residuals are differentiated through the implicit steps, or through the equilibrium. theta is any tree of float64
-arrays; `params_of(theta)` maps it to `Params`, for example by `exp` if a parameter must stay positive.
+Derivatives go through the implicit steps, or through the equilibrium. theta is any tree of float64 arrays;
+`params_of(theta)` maps it to `Params`, for example by `exp` if a parameter must stay positive.
 """
 
 import functools
@@ -36,7 +36,7 @@ class ObservedMotions(NamedTuple):
     """Actuation of the steps: an array [K, T, controls] ([K, T, 0] without actuation), or a dict of arrays [K, T, ...]
     by the names of the actuated terms."""
     x: Float[Array, "K T n dim"]
-    """Positions after every step, in m; not finite for vertices that were not seen."""
+    """Positions after every step, in m; not finite for unobserved vertices."""
 
 
 class SoftBodyFit(NamedTuple):
@@ -59,18 +59,18 @@ def identify(
     iterations: int = 30,
     mesh: Mesh | None = None,
 ) -> SoftBodyFit:
-    """Fits theta so that the simulated motions come closest to the observed ones.
+    """Fits theta to bring the simulated motions closest to the observed motions.
 
     Args:
         stepper: result of `make_step`.
         params_of: theta -> the scene's parameters.
         guess: initial theta, float64 arrays.
-        noise: standard deviation of the positions, in m, which divides the residuals.
+        noise: standard deviation of the positions, in m; it divides the residuals.
         iterations: largest number of Levenberg-Marquardt iterations.
         mesh: devices that share the motions; every device simulates its own.
 
     Raises:
-        InputError: numbers that are not positive.
+        InputError: a number is not positive.
     """
     require_positive(noise=noise, iterations=iterations)
     init, step = stepper
@@ -94,10 +94,10 @@ def design(
     noise: float = 1e-3,
     iterations: int = 30,
 ) -> SoftBodyFit:
-    """Finds theta (a rest shape, say) whose equilibrium is closest to the wanted positions.
+    """Finds theta (for example a rest shape) with the equilibrium closest to the wanted positions.
 
-    Held vertices stay where the scene's own rest shape has them; coordinates of `wanted` that are not finite do not
-    count. The other arguments, and the errors, are those of `identify`.
+    Held vertices stay at their places in the scene's rest shape. Non-finite coordinates of `wanted` are ignored. Other
+    arguments and errors are as for `identify`.
     """
     require_positive(noise=noise, iterations=iterations)
 
@@ -108,14 +108,14 @@ def design(
 
 
 def _seen_difference(x: Array, observed: Array) -> Array:
-    """Difference of positions, zero with finite derivatives where the observed ones are not finite."""
+    """Returns the difference of positions: zero, with finite derivatives, for non-finite observations."""
     seen = jnp.isfinite(observed)
     return jnp.where(seen, x - jnp.where(seen, observed, 0), 0)
 
 
 def _fitted(residual: Callable[[Any], Array], guess: Any, iterations: int, mesh: Mesh | None = None) -> SoftBodyFit:
     solver = optimistix.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
-    # Forward mode, because there are few parameters and thousands of residuals.
+    # Forward mode: there are few parameters and thousands of residuals.
     settings = {"options": {"jac": "fwd"}, "max_steps": iterations, "throw": False}
 
     def solve(guess: Any) -> tuple[Any, Array, Array]:

@@ -1,4 +1,4 @@
-"""Integrators whose time step is the minimum of an incremental potential.
+"""Integrators with time steps that minimise an incremental potential.
 
     x = argmin  1/2 sum m |x - y|² / h² + V(x)
 
@@ -9,16 +9,16 @@
 | midpoint | dt/2 | x_n + h v_n | x is at mid-step: x_{n+1} = 2 x - x_n, v_{n+1} = 2 (x - x_n) / h - v_n |
 | average-vector-field | dt/sqrt(2) | x_n + dt v_n | v_{n+1} = 2 (x - x_n) / dt - v_n |
 
-Backward Euler is of first order and damps; bdf2 is of second order and damps little. The midpoint rule is of second
-order and conserves momentum and angular momentum, but not energy: use it for smooth motions. The average-vector-field
-method (Quispel and McLaren 2008), of second order, conserves momentum and energy, not angular momentum, with the force
+Backward Euler has order 1 and damps; bdf2 has order 2 and damps little. The midpoint rule has order 2 and conserves
+momentum and angular momentum, but not energy: use it for smooth motions. The average-vector-field method (Quispel and
+McLaren 2008) has order 2 and conserves momentum and energy, but not angular momentum. Its force is
 
     F = -∫ grad V(x_n + s (x - x_n)) ds over 0 <= s <= 1,    so that    F·(x - x_n) = V(x_n) - V(x),
 
-and V is replaced by W(x) = ∫ V(x_n + s (x - x_n)) / s ds, whose gradient is -F. Gauss-Legendre quadrature with 2
-points in the plane and 3 in space is exact for the polynomials `stable_neo_hookean` and `st_venant_kirchhoff`; with
-`CONTACT_POINTS` it is nearly exact for contact, friction and springs. Barriers of obstacles are averaged; those of
-bodies are not, because they would need the pairs that are near anywhere between x_n and x.
+and W(x) = ∫ V(x_n + s (x - x_n)) / s ds with the gradient -F replaces V. Gauss-Legendre quadrature with 2 points in the
+plane and 3 in space is exact for the polynomials `stable_neo_hookean` and `st_venant_kirchhoff`; with `CONTACT_POINTS`
+it is nearly exact for contact, friction and springs. Barriers of obstacles are averaged. Barriers between bodies are
+not, because they would need all pairs that are near somewhere between x_n and x.
 """
 
 from collections.abc import Callable
@@ -45,19 +45,19 @@ class Integrator(NamedTuple):
     finish: Callable[[State, Array, Any], tuple[Array, Array]]
     """(state, x of the minimum, dt) -> x_{n+1}, v_{n+1}."""
     two_steps: bool = False
-    """Whether it needs the previous state."""
+    """True if it needs the previous state."""
     averaged: bool = False
-    """Whether forces are averages along the step, instead of those at x."""
+    """True if forces are averages along the step instead of values at x."""
 
 
 CONTACT_POINTS = 8
-"""Quadrature points of elements with fewer vertices than a simplex (contact, springs), which are cheap and have kinks.
+"""Quadrature points of elements with fewer vertices than a simplex (contact, springs); they are cheap and have kinks.
 In the example scenes a step creates up to 2 % of the current energy with 4 points, 0.2 % with 8 and 0.01 % with 16."""
 
 
 def _previous(state: State) -> Previous:
     if state.previous is None:
-        raise InputError("the state has no room for the state before; make it by the `init` beside this step")
+        raise InputError("the state has no previous state; create it with the `init` of this step")
     return state.previous
 
 
@@ -119,7 +119,7 @@ def averaged(element: ElementEnergy, dimension: int) -> ElementEnergy:
             return of_one(between, data)
 
         if solid:
-            # Written out, so that the few points fuse with the arithmetic of the element.
+            # Unrolled, so that the few points fuse with the arithmetic of the element.
             return jnp.asarray(sum(w / s * at(s) for s, w in zip(nodes.tolist(), weights.tolist(), strict=True)))
         return jnp.sum(weights / nodes * jax.vmap(at)(jnp.asarray(nodes, x[0][0].dtype)))
 

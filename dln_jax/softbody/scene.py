@@ -1,6 +1,6 @@
 """Scene of a soft body: a mesh, its energy terms, the held vertices and all parameters.
 
-Terms that a scene does not list are never traced. Everything in `Params` is differentiable and can be vmapped.
+Only the terms of a scene are traced. Everything in `Params` is differentiable and can be vmapped.
 """
 
 import reprlib
@@ -45,7 +45,7 @@ class SoftScene(NamedTuple):
     mesh: Mesh
     terms: tuple[Term, ...]
     held: Int[np.ndarray, " k"]
-    """Vertices that are not solved for: they move as `Motion` says, or with their velocity in `State.v`."""
+    """Vertices with a prescribed motion: from `Motion`, or with their velocity in `State.v`."""
     params: Params
     """Default parameters."""
     contacts: tuple[Contact, ...] = ()
@@ -53,7 +53,7 @@ class SoftScene(NamedTuple):
 
     @property
     def free(self) -> Bool[np.ndarray, "n dim"]:
-        """Mask of the coordinates that are solved for."""
+        """Mask of the free coordinates."""
         free = np.ones(self.mesh.vertices.shape, bool)
         free[self.held] = False
         return free
@@ -69,12 +69,12 @@ class Previous(NamedTuple):
 
 
 class Growth(NamedTuple):
-    """Energy that the steps of a motion have created, in J."""
+    """Energy created by the steps of a motion, in J."""
 
     created: Float[Array, ""]
     """Energy created since its minimum: max(created + energy_growth, 0), step by step."""
     at_hand: Float[Array, ""]
-    """Largest energy available to a step so far, without the created energy."""
+    """Largest energy available to a step so far, excluding the created energy."""
 
 
 class State(NamedTuple):
@@ -89,8 +89,8 @@ class State(NamedTuple):
     growth: Growth | None = None
     """Energy created so far, for `Info.converged` to detect slow divergence; `None` judges single steps only."""
     poses: tuple[Bool[Array, ""], dict[str, Pose]] | None = None
-    """Whether they are known, and the poses of rigid surfaces: those of the parameters of the previous step, from which
-    friction takes their motion. In a step from unknown poses, such as the first, surfaces are at rest."""
+    """Flag for known poses, and the poses of rigid surfaces from the parameters of the previous step; friction uses
+    them for the surface motion. In a step from unknown poses, such as the first, surfaces are at rest."""
 
 
 def make_scene(
@@ -109,8 +109,8 @@ def make_scene(
         terms: energy terms of the body.
         density: in kg/m³ (kg/m² in the plane), for the masses of the vertices; by default 1000.
         masses: masses of the vertices in kg, one for all or [n], instead of a density.
-        held: vertices that are not solved for: indices [k], or a boolean mask [n].
-        contacts: barrier contacts with obstacles and between bodies, which otherwise pass through each other.
+        held: vertices with a prescribed motion: indices [k], or a boolean mask [n].
+        contacts: barrier contacts with obstacles and between bodies; without them, bodies pass through each other.
 
     Raises:
         InputError: a name is used twice, a part was made for another mesh, an index or mass is out of range, both
@@ -131,9 +131,9 @@ def make_scene(
             raise InputError(f"term '{term.name}', element {wrong[0][0]} names vertex {vertex}; expected 0..{n - 1}")
     held = indices_of("held", held, n)
     if len(held) == n:
-        raise InputError(f"held names all {n} vertices; expected at least one that is free to move")
+        raise InputError(f"held names all {n} vertices; expected at least one free vertex")
     if masses is not None and density is not None:
-        raise InputError("masses and density were both given; leave out one of them")
+        raise InputError("masses and density are both set; leave out one of them")
     density = 1000.0 if density is None else density
     masses = lumped_masses(mesh, density) if masses is None else np.broadcast_to(np.asarray(masses, float), n)
     if len(bad := np.flatnonzero(~(np.isfinite(masses) & (masses > 0)))):
@@ -153,7 +153,7 @@ def with_parameters(params: Params, **terms: Mapping[str, Any]) -> Params:
     """Returns the parameters with some values replaced: `with_parameters(params, elastic={"youngs_modulus": 2e5})`.
 
     Args:
-        terms: new values by term and parameter name; numbers or arrays, traced or not. A name may be that of a value
+        terms: new values by term and parameter name; numbers or arrays, traced or not. A name may also refer to a value
             within a parameter, such as the `centre` of an obstacle's shape.
 
     Raises:
@@ -174,7 +174,7 @@ def with_parameters(params: Params, **terms: Mapping[str, Any]) -> Params:
 
 
 def _with_value(record: Any, field: str, value_for: Callable[[Any], Any]) -> Any:
-    """Returns the record with a new value of its field, or of that of a record in it; `None` if there is none."""
+    """Returns the record with a new value of a field, also in nested records; `None` without such a field."""
     if field in record._fields:
         return record._replace(**{field: value_for(getattr(record, field))})
     for place, inner in record._asdict().items():
@@ -185,7 +185,7 @@ def _with_value(record: Any, field: str, value_for: Callable[[Any], Any]) -> Any
 
 
 def _names(record: Any) -> Iterator[str]:
-    """Yields the names of a record's values, and of those of the records in it."""
+    """Yields the names of a record's values, also in nested records."""
     for name, inner in record._asdict().items():
         if hasattr(inner, "_fields"):
             yield from _names(inner)
@@ -194,7 +194,7 @@ def _names(record: Any) -> Iterator[str]:
 
 
 def _like(name: str, field: str, value: Any, params: Params, before: Any) -> Any:
-    """Converts a new parameter value to the precision of the scene; refuses a shape that does not fit."""
+    """Converts a new parameter value to the precision of the scene; refuses a wrong shape."""
     if not isinstance(before, Array | np.ndarray | float | int):
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, params.rest.dtype), value)
     what = f"term '{name}': {field}"
@@ -235,18 +235,18 @@ def prepare(
 
 
 def _by_term(scene: SoftScene, control: Any) -> Callable[[str], Any]:
-    """Returns a function from a term's name to its control: the array of the only actuator, or an entry of a dict."""
+    """Returns term name -> control: the array of the only actuator, or an entry of a dict."""
     driven = [term.name for term in scene.terms if term.control is not None]
     if control is None:
         return lambda _: None
     if not isinstance(control, Mapping):
         if len(driven) != 1:
             several = f"the actuators {', '.join(driven)}; pass a dict of arrays by these names"
-            none = "no actuator; leave it out, or give a term no value, so that it reads one"
+            none = "no actuator; pass no control, or leave out a term's value to control it"
             raise InputError(f"the control is one array, but the scene has {several if driven else none}")
         return {driven[0]: control}.get
     if unknown := [name for name in control if name not in driven]:
-        known = f"expected {', '.join(driven)}" if driven else "it has none: give a term no value, so that it reads one"
+        known = f"expected {', '.join(driven)}" if driven else "it has none: leave out a term's value to control it"
         raise InputError(f"the control names '{unknown[0]}', which is not an actuator of the scene; {known}")
     return control.get
 
@@ -284,7 +284,7 @@ def least_distance(
 
 
 def potential(scene: SoftScene, x: Float[Array, "n dim"], params: Params, control: Any = None) -> Array:
-    """Returns V(x) in J, the stored energy, for energy plots; dissipative terms are evaluated as if at rest at x."""
+    """Returns V(x) in J, the stored energy, for energy plots; dissipative terms are evaluated for rest at x."""
     stored = value(element_energies(scene), x, prepare(scene, params, x, control=control))
     energies, data = contact_energies(scene), prepare_contacts(scene, params, x)
     return stored + moving_gradient(energies, x, lists_between(energies, x, jnp.zeros_like(x), data), data)[0]

@@ -33,14 +33,14 @@ Step = Callable[..., tuple[Any, Info]]
 
 
 class Motion(NamedTuple):
-    """What moves held vertices and rigid surfaces in a step; what is `None` is not moved."""
+    """Motion of held vertices and rigid surfaces in a step; `None` for no motion."""
 
     held: Float[Array, "k dim"] | None = None
     """Positions in m of the scene's held vertices at the end of the step, in ascending order of the vertices. Without
     them, held vertices keep their velocity."""
     surfaces: Mapping[str, Mapping[str, Any]] | None = None
     """Places of planes and obstacles at the end of the step, as for `with_parameters`: {"belt": {"centre": c}}.
-    Friction and damping take their velocity from the step before. Other surfaces are where the parameters say."""
+    Friction and damping take their velocity from the previous step. The parameters place all other surfaces."""
     torque: Float[Array, " d"] | None = None
     """Generalised forces in N m or N at the joints of a robot (`make_tied_step`) at the end of the step."""
 
@@ -73,19 +73,19 @@ def make_step(
 
     Args:
         scene: the body; only its own terms are compiled.
-        dt: in s; a traced value, whose sign is not checked, lets one program serve several step lengths.
+        dt: in s. With a traced value one program serves several step lengths; its sign is not checked.
         integrator: `BACKWARD_EULER`, `BDF2`, `MIDPOINT`, `AVERAGE_VECTOR_FIELD` or a custom one.
         tolerance: largest residual force per mass, in m/s², of a converged step; rounding always counts as converged.
-        iterations: largest number of Newton steps per time step; `Info.converged` reports whether they sufficed.
+        iterations: largest number of Newton steps per time step; `Info.converged` is false if they do not suffice.
         linear_solver: solver of the linear systems; by default the cheapest for the stiffness in `scene.params` and
-            this time step (`by_size` if either is traced, or if a term's preparation needs a control). Parameters
-            passed to the step later do not change the choice.
-        definite: also report `Info.definite`, at the cost of another Hessian, factorisation and solve in every step.
-        halvings: repeat a step that does not converge in parts, the shortest of dt/2^halvings; `Info.substeps` reports
-            their number. This compiles the step a second time.
-        friction_iterations: number of times to solve the step again with the normal forces and directions of friction
-            at the previous solution instead of those at the start (`friction_iterations`). `Info.friction_change`
-            reports how much one more would change. Without them, friction lags by a step.
+            this time step (`by_size` if either is traced, or if a term's preparation needs a control). Later parameters
+            of the step do not change the choice.
+        definite: also report `Info.definite`, which takes another Hessian, factorisation and solve in every step.
+        halvings: repeat a step that does not converge in parts of at least dt/2^halvings; `Info.substeps` reports their
+            number. This compiles the step a second time.
+        friction_iterations: number of repeated solutions of the step with normal forces and friction directions from
+            the previous solution (see `softbody.step_parts`). `Info.friction_change` reports the change by one more.
+            With 0, friction lags by a step.
 
     Raises:
         InputError: a number is not positive, or halvings are used with a two-step method.
@@ -93,7 +93,7 @@ def make_step(
     if halvings:
         require_positive(halvings=halvings)
         if integrator.two_steps:
-            raise InputError("halvings got a method of two steps, which have one length; use another integrator")
+            raise InputError("halvings need a one-step method; use another integrator")
     problem = step_problem(
         scene,
         dt,
@@ -114,14 +114,14 @@ def make_step(
 
     def step(params: Params, state: State, control: Any = None, motion: Motion | None = None) -> tuple[State, Info]:
         if motion is not None and motion.torque is not None:
-            raise InputError("the motion has a torque, but no robot carries the scene; use make_tied_step")
+            raise InputError("the motion has a torque, but the scene has no robot; use make_tied_step")
         return whole(*moved(scene, params, state, motion, dt), control)
 
     return Stepper(partial(initial_state, problem), step)
 
 
 def moved(scene: SoftScene, params: Params, state: State, motion: Motion | None, dt: Any) -> tuple[Params, State]:
-    """Returns the parameters with the surfaces' places, and the state with the velocities of held vertices."""
+    """Returns the parameters with the places of surfaces, and the state with the velocities of held vertices."""
     if motion is not None and motion.held is not None:
         held, (k, dimension) = jnp.asarray(motion.held, state.x.dtype), (len(scene.held), scene.mesh.dimension)
         if held.shape != (k, dimension):
@@ -133,7 +133,7 @@ def moved(scene: SoftScene, params: Params, state: State, motion: Motion | None,
 
 
 def positions_and_convergence(state: State, info: Info) -> tuple[Array, Array]:
-    """Returns x [n, dim] and whether the step converged, for `rollout`."""
+    """Returns x [n, dim] and the convergence flag of a step, for `rollout`."""
     return state.x, info.converged
 
 

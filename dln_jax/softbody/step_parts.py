@@ -1,12 +1,12 @@
 """The parts of an implicit time step: the minimum, the forces there, and the verdict.
 
-A step may be solved again, so that friction uses the normal forces at its end:
+A repeated solution of a step lets friction use the normal forces at its end:
 
     x^(j+1) = argmin E(x; normal forces and directions of friction at x^(j)),    x^(0) = x_n
 
 These are the friction iterations of Li et al. 2020 (Incremental Potential Contact). A fixed point obeys Coulomb's law
 with the normal forces at the end of the step. Convergence is not guaranteed, but the error usually falls by a constant
-factor per iteration. Every solution warm-starts the next, which takes no Newton step once forces are constant.
+factor per iteration. Every solution warm-starts the next; with constant forces, the next takes no Newton step.
 """
 
 from collections.abc import Callable
@@ -51,7 +51,7 @@ from dln_jax.types import InputError, require_positive
 
 
 class Problem(NamedTuple):
-    """The minimisation of every step, as far as it is known before tracing."""
+    """The minimisation of a step: everything known before tracing."""
 
     scene: SoftScene
     integrator: Integrator
@@ -68,7 +68,7 @@ class Problem(NamedTuple):
 
 
 class StepData(NamedTuple):
-    """Data of one step with the normal forces of friction at some positions."""
+    """Data of one step, with the normal forces of friction at given positions."""
 
     terms: tuple[Any, ...]
     """Data of the scene's terms."""
@@ -100,19 +100,19 @@ def step_problem(
     definite: bool = False,
     friction_iterations: int = 1,
 ) -> Problem:
-    """Returns the minimisation of the step that `make_step` returns; arguments are explained there."""
+    """Returns the minimisation in a step; arguments as for `make_step`."""
     if friction_iterations:
         require_positive(friction_iterations=friction_iterations)
     if not isinstance(dt, Tracer):
         require_positive(dt=dt)
     if scene.contacts and integrator.span != 1.0:
         raise InputError(
-            "this integrator does not end where forces balance, which may push bodies through each other; "
+            "this integrator's steps do not end in a balance of forces, so bodies may pass through each other; "
             "use BACKWARD_EULER, BDF2 or, with obstacles only, AVERAGE_VECTOR_FIELD"
         )
     if integrator.averaged and any(contact.changing for contact in scene.contacts):
         raise InputError(
-            "forces between bodies cannot be averaged along the step, because the pairs that touch change; "
+            "forces between bodies cannot be averaged along the step, because the contact pairs change; "
             "use BACKWARD_EULER or BDF2"
         )
     terms, moving, params = element_energies(scene), contact_energies(scene), scene.params
@@ -160,7 +160,7 @@ def initial_state(problem: Problem, x: Any = None, v: Any = None) -> State:
     for name, values in (("x", x), ("v", v)):
         known = not isinstance(values, Tracer)
         if known and len(wrong := np.argwhere(~np.isfinite(np.broadcast_to(np.asarray(values), scene.free.shape)))):
-            raise InputError(f"{name} of vertex {wrong[0][0]} is not finite; expected numbers")
+            raise InputError(f"{name} of vertex {wrong[0][0]} is not finite; expected finite numbers")
     x, v = (jnp.broadcast_to(jnp.asarray(values, float), scene.free.shape) for values in (x, v))
     previous = Previous(x, v, jnp.asarray(False)) if problem.integrator.two_steps else None
     poses = (jnp.asarray(False), scene.params.poses) if scene.params.poses else None
@@ -170,7 +170,7 @@ def initial_state(problem: Problem, x: Any = None, v: Any = None) -> State:
 def step_data(
     problem: Problem, params: Params, state: State, inertia: tuple[Array, Array], control: Any = None, **settings: Any
 ) -> StepData:
-    """Returns the data of a step with these weights and targets of inertia; the settings are those of `prepare`."""
+    """Returns the data of a step with these weights and targets of inertia; settings as for `prepare`."""
     scene = problem.scene
     terms = prepare(scene, params, state.x, control=control, **settings)
     contacts = prepare_contacts(scene, params, state.x, **settings)
@@ -178,7 +178,7 @@ def step_data(
         return StepData(terms, (inertia, *terms), contacts)
 
     def start(name: str) -> Array:
-        """Returns the start of the way relative to a surface, along which its forces are averaged."""
+        """Returns the start of the path relative to a surface; its forces are averaged along the path."""
         return state.x + motion_of(name, params.terms[name], settings.get("before"), state.x)
 
     of_step = zip(scene.terms, element_energies(scene), terms, strict=True)
@@ -204,7 +204,7 @@ def balance(
         known, last = state.poses
         share = jnp.asarray(known * integrator.span * dt / problem.dt, span.dtype)
         before = jax.tree.map(lambda now, then: now + share * (then - now), params.poses, last)
-    # Averaging along the step halves a linear damping force; half the time makes it that of the mean velocity.
+    # Averaging along the step halves a linear damping force; half the time restores the force of the mean velocity.
     elapsed = span / 2 if integrator.averaged else span
 
     def prepared(lag: Array | None) -> StepData:
@@ -219,7 +219,7 @@ def balance(
     if problem.moving:
         start = state.x if x_after is None else x_after
     elif x_after is None:
-        # The better of two starts: the current positions, or those of a motion without forces.
+        # The better of two starts: the current positions, or the positions of a motion without forces.
         stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
         energy = jax.vmap(lambda x: value(problem.energies, x, first.energies))
         of_coast, of_stay = energy(jnp.stack([coast, stay]))
@@ -227,7 +227,7 @@ def balance(
     else:
         start = jnp.where(free, state.x + integrator.span * (x_after - state.x), carried)
     if problem.friction_iterations:
-        # Forces averaged along the step take the normal forces at its middle.
+        # Averaged forces use the normal forces at the middle of the step.
         middle = 0.5 if integrator.averaged else 1.0
 
         def again(carry: tuple[Array, Any, StepData], _: None) -> tuple[tuple[Array, Any, StepData], SolverInfo]:
@@ -235,7 +235,7 @@ def balance(
             x, outcome = solved(start, data)
             return (x, data, prepared(state.x + middle * (x - state.x))), outcome
 
-        # The derivative of this loop goes through every minimum: it is exact even if forces still change.
+        # The derivative of this loop passes through every minimum, so it is exact even if forces still change.
         begin = start, first, first
         (x, data, at_end), outcomes = jax.lax.scan(again, begin, None, length=problem.friction_iterations + 1)
         outcome = jax.tree.map(lambda values: values[-1], outcomes)._replace(
@@ -264,7 +264,7 @@ def conclude(problem: Problem, params: Params, state: State, balanced: Balanced,
     """Returns the state after the step, and the verdict."""
     integrator, free = problem.integrator, problem.scene.free
     x, v = integrator.finish(state, balanced.x, dt)
-    # If a contact keeps held vertices from their targets, moving them there would push them through it.
+    # If a contact holds back held vertices, moving them to their targets would push them through it.
     x = jnp.where(free, x, balanced.x if problem.moving else state.x + dt * state.v)
     v = jnp.where(free, v, state.v)
     # The verdict has no derivatives.

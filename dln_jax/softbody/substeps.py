@@ -1,11 +1,11 @@
-"""Time steps that are divided where they do not converge.
+"""Division of time steps that do not converge.
 
-A step of dt that does not converge is repeated from its start in parts of dt/2, dt/4, ..., dt/2^halvings: a part that
-does not converge is halved, and later parts keep the shorter length. The parts are a loop, which runs zero times for a
-step that converges.
+A step of dt without convergence is repeated from its start in parts of dt/2, dt/4, ..., dt/2^halvings. A part without
+convergence is halved, and later parts keep the shorter length. The loop over the parts runs zero times if the step
+converges.
 
-The derivative of the step is the product of the derivatives of its parts: loops over the parts taken, forwards for
-tangents and backwards for cotangents, which evaluate every part again from its known solution.
+The derivative of the step is the product of the derivatives of its parts. Loops over the parts, forwards for tangents
+and backwards for cotangents, evaluate every part again from its known solution.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ Advance = Callable[..., tuple[State, Info]]
 
 
 class Parts(NamedTuple):
-    """The parts of a step that converged; entries from `taken` on are empty."""
+    """The converged parts of a step; entries from `taken` on are empty."""
 
     x: Float[Array, "parts n dim"]
     """Positions at the starts of the parts, in m."""
@@ -39,12 +39,12 @@ class Parts(NamedTuple):
 
 
 def with_shorter_steps(advance: Advance, dt: Any, halvings: int) -> Callable[..., tuple[State, Info]]:
-    """Returns the step (params, state, control=None) -> (state, Info) that divides itself.
+    """Returns a step (params, state, control=None) -> (state, Info) that divides itself if necessary.
 
-    If the shortest parts do not converge either, the result is that of the whole step, which did not converge.
+    If the shortest parts do not converge either, the result is the whole step without convergence.
 
     Args:
-        advance: step of a one-step integrator, of any length.
+        advance: step of a one-step integrator, for any length.
         dt: length of the whole step, in s.
         halvings: the shortest part is dt/2^halvings.
     """
@@ -131,8 +131,8 @@ def with_shorter_steps(advance: Advance, dt: Any, halvings: int) -> Callable[...
 def _chain(most: int, count: Array, tangent: Callable, cotangent: Callable, inputs: Any) -> tuple[Array, Array]:
     """Returns G (dots, start): the tangent after all parts, from the tangents of their inputs and of the start.
 
-    Written as the second half of the solution of [[1, 0], [-G, 1]] (inputs, out) = (inputs, 0), because JAX lets
-    callers define the transpose of a linear solve, and a loop of unknown length has no other.
+    It is the second half of the solution of [[1, 0], [-G, 1]] (inputs, out) = (inputs, 0): JAX lets callers define the
+    transpose of a linear solve, and a loop of unknown length has no transpose of its own.
     """
 
     def forwards(inputs: Any) -> tuple[Array, Array]:
@@ -147,11 +147,11 @@ def _chain(most: int, count: Array, tangent: Callable, cotangent: Callable, inpu
 
         return jax.lax.fori_loop(0, count, back, (jax.tree.map(jnp.zeros_like, inputs[0]), bars))
 
-    # One vector: a solve is transposed only if every part of its right-hand side has a tangent.
+    # One vector, because a solve is transposed only if every part of its right-hand side has a tangent.
     right, parts = ravel_pytree((inputs, jax.tree.map(jnp.zeros_like, inputs[1])))
 
     def product(both: Array) -> Array:
-        # A loop of fixed length, which can be transposed; it is evaluated for second derivatives only.
+        # A loop of fixed length can be transposed; only second derivatives evaluate it.
         inputs, out = parts(both)
 
         def one(moved: Any, number: Array) -> tuple[Any, None]:

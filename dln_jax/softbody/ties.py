@@ -1,12 +1,12 @@
-"""Soft bodies carried by a robot: held vertices move with its joints, which feel the forces.
+"""Soft bodies on a robot: held vertices move with its joints, and their forces act on the joints.
 
     tau + (dx_held/dq)ᵀ f = M(q) qdd + c(q, qd) + g(q),    x_held = carry(q, rest shape),    f = -dE/dx_held
 
 E is the incremental potential of the soft body's step (its energies and inertia), minimised over the free vertices, so
-f includes the weight and the inertia of the held vertices. Both equations hold at the end of the step: the joint
-positions are the root of the first one, found by Newton's method around the minimisation. Its Jacobian, the added
-stiffness and mass of the soft body, comes from the implicit function theorem. The coupled step is therefore stable
-whichever is heavier or stiffer.
+f includes the weight and the inertia of the held vertices. Both equations hold at the end of the step: Newton's method
+around the minimisation solves the first equation for the joint positions. Its Jacobian, the added stiffness and mass of
+the soft body, comes from the implicit function theorem. The coupled step is therefore stable for any ratio of masses or
+stiffnesses.
 """
 
 from collections.abc import Callable
@@ -26,12 +26,12 @@ from dln_jax.solvers.newton import find_root
 from dln_jax.types import InputError, Vector, require_positive
 
 REACHED = 1e-9
-"""Largest distance of a held vertex from its place on the robot, relative to the extent of the body. A vertex that
-contact holds back is farther away."""
+"""Largest distance of a held vertex from its place on the robot, relative to the extent of the body. Contact can hold
+back a vertex farther away."""
 
 
 class TiedState(NamedTuple):
-    """State of a robot and of the soft bodies that it carries."""
+    """State of a robot and of its soft bodies."""
 
     robot: State
     """x is q [d] in rad or m, v is qd [d]."""
@@ -49,34 +49,34 @@ def make_tied_step(
     joint_iterations: int = 20,
     **settings: Any,
 ) -> Stepper:
-    """Returns (init, step) of a robot that carries the soft bodies of a scene by their held vertices.
+    """Returns (init, step) of a robot with soft bodies attached at their held vertices.
 
-    init(q, qd=0, x=None, v=None) -> TiedState. By default the bodies are where the robot carries their rest shape.
-    step(params, state, control=None, motion=None) -> (TiedState, Info of the soft bodies) is differentiable in all its
-    arguments. `Motion.torque` are the joints' forces at the end of the step, by default zero. `Info.converged` also
-    requires that the joints' equations hold and that no contact keeps a held vertex from its place. Each step takes one
-    minimisation per iteration on q (2 or 3) and a final one.
+    init(q, qd=0, x=None, v=None) -> TiedState. By default the bodies have their rest shape on the robot. step(params,
+    state, control=None, motion=None) -> (TiedState, Info of the soft bodies) is differentiable in all its arguments.
+    `Motion.torque` holds the joint forces at the end of the step, by default zero. `Info.converged` also requires that
+    the joint equations hold and that every held vertex is at its place. Each step takes one minimisation per iteration
+    on q (2 or 3) and a final one.
 
     Args:
         scene: its held vertices move with the robot.
         dt: in s.
-        carry: (q, rest shape) -> positions in m of its vertices if the robot carried them rigidly. Vertices of other
-            bodies stay: return them as they are.
+        carry: (q, rest shape) -> positions in m of all vertices rigidly attached to the robot. Return the vertices of
+            other bodies unchanged.
         inverse_dynamics: (q, qd, qdd) -> tau of the robot alone, from a known tree or a learned model.
         integrator: `BACKWARD_EULER` or `BDF2`, for robot and bodies.
-        torque_tolerance: largest residual of the joints' equations, in N m (or N).
+        torque_tolerance: largest residual of the joint equations, in N m (or N).
         joint_iterations: largest number of Newton iterations on q.
         settings: tolerance, iterations, linear_solver, definite and friction_iterations of `make_step`.
 
     Raises:
-        InputError: the integrator does not end where forces balance, no vertex is held, or `carry` returns another
-            number of positions.
+        InputError: the integrator's steps do not end in a balance of forces, no vertex is held, or `carry` returns
+            another number of positions.
     """
     require_positive(dt=dt, torque_tolerance=torque_tolerance, joint_iterations=joint_iterations)
     if integrator.span != 1.0 or integrator.averaged:
-        raise InputError("tied steps need an integrator that ends where forces balance: BACKWARD_EULER or BDF2")
+        raise InputError("tied steps need an integrator that ends in a balance of forces: BACKWARD_EULER or BDF2")
     if not len(scene.held):
-        raise InputError("the scene holds no vertex; pass the vertices that the robot carries to make_scene as held")
+        raise InputError("the scene has no held vertex; pass the vertices on the robot to make_scene as held")
     problem, held = step_problem(scene, dt, integrator, **settings), scene.held
     reached = REACHED * float(np.ptp(scene.mesh.vertices, axis=0).max())
 
@@ -97,7 +97,7 @@ def make_tied_step(
     def soft(params: Params, body: State, q: Vector, control: Any) -> tuple[State, Balanced]:
         _, driven = moved(scene, params, body, Motion(carried(q, params.rest)[held]), dt)
         balanced = balance(problem, params, driven, control, dt)
-        # The inertia of the held vertices is relative to their motion before the step.
+        # The inertia of the held vertices refers to their motion before the step.
         (weights, _), *others = balanced.data.energies
         energies = ((weights, integrator.target(body, dt)[1]), *others)
         return driven, balanced._replace(data=balanced.data._replace(energies=energies))
@@ -114,7 +114,7 @@ def make_tied_step(
     ) -> tuple[TiedState, Info]:
         robot, motion = state.robot, motion or Motion()
         if motion.held is not None:
-            raise InputError("the motion gives places of held vertices, which the robot carries; leave them out")
+            raise InputError("the motion moves held vertices, but the robot moves them; leave them out")
         params, _ = moved(scene, params, state.body, motion, dt)
         tau = jnp.zeros_like(robot.x) if motion.torque is None else jnp.asarray(motion.torque, robot.x.dtype)
         q, outcome = find_root(
@@ -129,7 +129,7 @@ def make_tied_step(
         )
         body, info = conclude(problem, params, *soft(params, state.body, q, control), dt)
         missed = jnp.max(jnp.abs(body.x[held] - carried(q, params.rest)[held]))
-        # Held vertices move with the body: their velocity is the integrator's, not that of a straight line.
+        # Held vertices move with the body, so the integrator gives their velocity.
         v = integrator.finish(state.body, body.x, dt)[1][held]
         body = body._replace(v=body.v.at[held].set(v))
         if integrator.two_steps:

@@ -1,15 +1,15 @@
-"""Reliability of a time step: balanced forces are not enough.
+"""Reliability of a time step, because balanced forces are not enough.
 
-A long step of an undamped method can create energy without bound, and an impact can invert elements, although the
-forces of every step are balanced. Over one step,
+A long step of an undamped method can create energy without bound, and an impact can invert elements, even with balanced
+forces in every step. Over one step,
 
     growth = (T + V)' - (T + V) - W,    at hand = T + max(V - V', 0) + |W|
 
 with the kinetic energy T of the free vertices, the potential V (both values with the actuation and the lagged contact
 of this step) and the work W done by held vertices. The exact motion has growth <= 0. A step that creates more than
-`LARGEST_GROWTH` of the energy at hand has diverged. Slow growth, of a percent per step, contains no such step.
-Therefore the state also carries the energy created since its minimum, max(created + growth, 0), which may not exceed
-the same share of the largest energy at hand so far.
+`LARGEST_GROWTH` of the energy at hand has diverged. Slow growth, a percent per step, contains no such step. Therefore
+the state also carries the energy created since its minimum, max(created + growth, 0). It must not exceed the same share
+of the largest energy at hand so far.
 """
 
 from collections.abc import Sequence
@@ -27,11 +27,11 @@ from dln_jax.solvers.elements.moving import MovingEnergy, moving_gradient
 from dln_jax.solvers.newton import SolverInfo
 
 TOLERANCE = 1e-6
-"""Default largest residual force per mass, in m/s²; Newton's last step usually gets far below it."""
+"""Default of the largest residual force per mass, in m/s²; Newton's last step usually goes far below it."""
 LARGEST_GROWTH = 0.1
 """Share of the energy at hand. In the example scenes, backward Euler, BDF2 and the average-vector-field method stay
-below 0.012 per step and 0.023 per motion, and smooth motions of the midpoint rule below 1e-3; contact that the midpoint
-rule does not resolve reaches 0.1 to 5 before it diverges."""
+below 0.012 per step and 0.023 per motion, and smooth motions of the midpoint rule below 1e-3; unresolved contact of the
+midpoint rule reaches 0.1 to 5 before it diverges."""
 
 
 class Info(NamedTuple):
@@ -42,26 +42,27 @@ class Info(NamedTuple):
     iterations: Int[Array, ""]
     """Newton iterations."""
     converged: Bool[Array, ""]
-    """Whether to trust the result: forces balance, no divergence, no inverted element. Else derivatives are NaN."""
+    """True for a reliable result: balanced forces, no divergence, no inverted element. Otherwise derivatives are
+    NaN."""
     definite: Bool[Array, ""] | None = None
-    """Whether the Hessian at the minimum is positive definite; `None` unless requested."""
+    """True if the Hessian at the minimum is positive definite; `None` unless requested."""
     energy_growth: Float[Array, ""] | None = None
     """Energy created by the step, in J; negative for damping. `None` for a static solve."""
     energy_at_hand: Float[Array, ""] | None = None
     """Energy available to the step, in J, including rounding and tolerance. `None` for a static solve."""
     diverged: Bool[Array, ""] | None = None
-    """Whether step or motion created more than `LARGEST_GROWTH` of the energy at hand. `None` for a static solve."""
+    """True if step or motion created more than `LARGEST_GROWTH` of the energy at hand. `None` for a static solve."""
     least_J: Float[Array, ""] | None = None
-    """Smallest volume ratio J of elements that resist deformation, if any; at quadrature points if quadratic."""
+    """Smallest volume ratio J of elastic elements, if any; at quadrature points if quadratic."""
     substeps: Int[Array, ""] | None = None
-    """Number of parts that the step was divided into, 1 for a whole step; `None` without `halvings`."""
+    """Number of parts of the step, 1 for a whole step; `None` without `halvings`."""
     least_distance: Float[Array, ""] | None = None
-    """Smallest distance in m between surfaces in contact, capped at the distance within which contact acts."""
+    """Smallest distance in m between surfaces in contact, capped at the contact distance."""
     friction_change: Float[Array, ""] | None = None
     """Largest change of friction on a vertex, as force per mass in m/s², if normal forces and directions were taken
     from the end of the step; `None` without friction or `friction_iterations`. Does not affect `converged`."""
     overflow: Bool[Array, ""] | None = None
-    """Whether lists of contact pairs were too short: the step does not converge and needs a larger `capacity`."""
+    """True if a list of contact pairs was too short: the step does not converge and needs a larger `capacity`."""
 
 
 def verdict_on_energies(
@@ -76,7 +77,7 @@ def verdict_on_energies(
     outcome: SolverInfo,
     contact: Float[Array, "2"] | float,
 ) -> tuple[Info, Growth | None]:
-    """Adds the verdict on energies; returns the outcome, and the energy created so far if the state carries it.
+    """Adds the verdict on energies; returns the outcome, and the energy created so far if the state tracks it.
 
     Args:
         info: the verdict on positions.
@@ -91,7 +92,7 @@ def verdict_on_energies(
     free = jnp.asarray(scene.free)
     kinetic, after = (0.5 * jnp.sum(jnp.where(free, masses[:, None] * velocity**2, 0)) for velocity in v)
     energies = element_energies(scene)
-    # One trace for both: the energies are most of the verdict's program.
+    # One trace for both, because the energies are most of the program.
     stored, stored_after = contact + jax.vmap(lambda at: value(energies, at, data))(jnp.stack(x))
     noise = 0.0 if outcome.energy_noise is None else outcome.energy_noise
     # The part of the energy at hand due to rounding and to the work of the residual forces.
@@ -154,7 +155,7 @@ def friction_change(
 def verdict_on_positions(
     scene: SoftScene, params: Params, x: Array, outcome: SolverInfo, contact: Sequence[Any]
 ) -> Info:
-    """Combines the solver's verdict with that on the positions: no element may be inverted."""
+    """Combines the solver's verdict with the check of positions: no element may be inverted."""
     elements, least, converged = scene.mesh.nodes, None, outcome.converged
     if len(elements) and any(np.array_equal(term.indices, elements) for term in scene.terms):
         least = jnp.min(volume_ratios(x, params.rest, elements))
@@ -172,7 +173,7 @@ def verdict_on_positions(
 
 @jax.custom_jvp
 def trusted(values: Any, converged: Bool[Array, ""]) -> Any:
-    """Returns the values; their derivatives are NaN unless converged."""
+    """Returns the values; without convergence their derivatives are NaN."""
     return values
 
 

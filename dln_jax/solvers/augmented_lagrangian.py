@@ -1,4 +1,4 @@
-"""Smooth minimisation under many inequalities, by an augmented Lagrangian, in float64.
+"""Smooth minimisation with many inequality constraints by an augmented Lagrangian, in float64.
 
     minimise f(x) subject to g(x) <= 0
 
@@ -7,12 +7,12 @@ With multipliers mu >= 0 and a penalty rho, a round minimises
     f(x) + sum over i of (max(0, mu_i + rho g_i(x))² - mu_i²) / (2 rho)
 
 without constraints by L-BFGS (SciPy), then sets mu <- max(0, mu + rho g) (Powell, Hestenes, Rockafellar; Nocedal and
-Wright 2006, "Numerical Optimization", section 17.4). The penalty grows after every round that has not reduced the
+Wright 2006, "Numerical Optimization", section 17.4). The penalty grows after every round that does not reduce the
 violation to a quarter. The solution may violate a constraint by about `tolerance`; the caller must check.
 
 SciPy's own constrained methods were compared on the excitation problems of two arms (10 and 14 unknowns, 480 and 720
-constraints). SLSQP takes a tenth of the time, but ended in poorer minima from four of seven starts: once at a condition
-number of 25 instead of 9. `trust-constr` took more than a hundred times as long and ended in even poorer minima.
+constraints). SLSQP takes a tenth of the time, but ended in worse minima from four of seven starts (once a condition
+number of 25 instead of 9). `trust-constr` took more than a hundred times as long and ended in even worse minima.
 """
 
 from collections.abc import Callable
@@ -53,7 +53,7 @@ def make_minimiser(
     growth: float = 5.0,
     tolerance: float = 1e-3,
 ) -> Callable[..., Minimum]:
-    """Returns a function (x0, *arguments) -> `Minimum`, compiled once for all starts and arguments of the same shapes.
+    """Returns a function (x0, *arguments) -> `Minimum`, compiled once per set of shapes.
 
     Args:
         rounds: largest number of rounds; the search ends earlier once x satisfies the constraints within `tolerance`

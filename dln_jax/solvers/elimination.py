@@ -1,13 +1,13 @@
-"""Dense linear systems and factorisations of one matrix: unrolled for a few rows, by LAPACK for more.
+"""Dense linear systems and factorisations of one matrix: unrolled for small ones, by LAPACK for others.
 
 The Hessians of learned energies need not be definite, so Cholesky does not apply. The matrices of mechanics have a few
 rows and come in batches. Gaussian elimination and substitution, unrolled row by row, fuse with their surroundings: up
 to a dozen rows they are faster than library calls.
 
-On a CPU, JAX passes a batch to a library call that splits it over the threads that also run the programs of other
-devices. If these programs wait for one another, all deadlock (seen with jaxlib 0.10.2: two devices of one process, or
-several batched calls in one program on two cores). So under `vmap` on a CPU, matrices are factorised one after the
-other; on other platforms a batch is one call. Factors have no derivatives; callers supply those of the solution.
+On a CPU, JAX splits a batched library call over the threads that also run the programs of other devices. Programs that
+wait for one another then deadlock (seen with jaxlib 0.10.2: two devices of one process, or several batched calls in one
+program on two cores). So under `vmap` on a CPU, matrices are factorised one after the other; on other platforms a batch
+is one call. Factors have no derivatives; callers define the derivatives of the solution.
 """
 
 import functools
@@ -26,7 +26,7 @@ _UNROLLED_ROWS = 16
 
 
 def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns a function of arrays whose batching rule loops over the batch on a CPU."""
+    """Returns the function with a batching rule that loops over the batch on a CPU."""
 
     @jax.custom_batching.custom_vmap
     def of_one(*arguments: Array) -> Any:
@@ -73,7 +73,7 @@ def symmetric_eigen(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Fl
 def solve(matrix: Float[Array, "n n"], b: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
     """Returns x with A x = b, for b [n] or [n, k]; not finite for an exactly singular matrix.
 
-    Derivatives of every order are those of the solution (A dx = db - dA x), not of the elimination's steps.
+    Derivatives of every order follow from A dx = db - dA x, not from the steps of the elimination.
     """
     if b.shape[0] == 1:
         return b / matrix[0]
@@ -153,7 +153,7 @@ def _eliminate(matrix: Float[Array, "n n"], b: Float[Array, "n *columns"]) -> Fl
     rows = jnp.concatenate([matrix, b.reshape(n, -1)], axis=1)
     pivots = []
     for _ in range(n):
-        # Selected by comparison: indexing by a computed row compiles more slowly.
+        # Selection by comparison compiles faster than indexing by a computed row.
         chosen = (jnp.arange(len(rows)) == jnp.argmax(jnp.abs(rows[:, 0])))[:, None]
         pivot = jnp.sum(jnp.where(chosen, rows, 0), axis=0)
         rows = jnp.where(chosen, rows[0], rows)[1:]

@@ -1,4 +1,4 @@
-"""Reasons why an iteration ended: numbers that can be traced, and their sentences."""
+"""Reasons for the end of an iteration: traceable numbers, and a sentence for each."""
 
 from enum import IntEnum
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 
 
 class Ending(IntEnum):
-    """Outcomes of an iteration; arrays of them may be traced, and `reason` puts them into words."""
+    """Outcomes of an iteration, also as traced arrays; `reason` gives the sentence."""
 
     CONVERGED = 0
     OUT_OF_ITERATIONS = 1
@@ -22,8 +22,8 @@ class Ending(IntEnum):
 
 REASONS = {
     Ending.CONVERGED: "converged within the tolerance",
-    Ending.OUT_OF_ITERATIONS: "used up its iterations before it reached the tolerance; allow more, or start closer",
-    Ending.NO_DESCENT: "found no step that improves; scale the problem, or start closer",
+    Ending.OUT_OF_ITERATIONS: "ran out of iterations before it reached the tolerance; allow more, or start closer",
+    Ending.NO_DESCENT: "found no improving step; scale the problem, or start closer",
     Ending.NOT_FINITE: "met a number that is not finite; start closer, or bound the states and controls",
     Ending.VIOLATED: "ended where constraints are violated (`worst_violation` names the worst); start closer, "
     "or make them soft",
@@ -37,5 +37,5 @@ REASONS = {
 
 
 def reason(ending: Any) -> str:
-    """Returns the sentence for an `Ending`, or for a one-element array that holds it."""
+    """Returns the sentence for an `Ending`, or for an array of one."""
     return REASONS[Ending(int(np.asarray(ending)))]

@@ -1,14 +1,14 @@
-"""Least squares with scaled columns, by the singular value decomposition, in float64: linear, and separable.
+"""Linear and separable least squares by singular value decomposition with scaled columns, in float64.
 
 With D the diagonal of column norms of A, y = D x and the decomposition A D⁻¹ = U S Vᵀ,
 
     y = V (S² + ridge 1)⁻¹ S Uᵀ b        minimises |A x - b|² + ridge |D x|²
 
 Scaled columns make rank and condition independent of the units of the unknowns (Golub and Van Loan 2013, "Matrix
-Computations", sections 5.3.8 and 5.5). Singular values that are only rounding are left out, which gives the shortest y
-of all that fit equally well. A tall A is first replaced by its triangular factor; AᵀA is never formed.
+Computations", sections 5.3.8 and 5.5). Singular values at rounding level are left out, which gives the shortest y among
+equally good ones. A tall A is first replaced by its triangular factor; AᵀA is never formed.
 
-A separable problem has a few nonlinear unknowns n, and many linear ones x that are eliminated in every step:
+A separable problem has a few nonlinear unknowns n and many linear unknowns x, which every step eliminates:
 
     minimise over (x, n) |A(n) x - b(n)|²   =   minimise over n |(1 - U Uᵀ) b|²,   A = U S Vᵀ
 
@@ -17,7 +17,7 @@ variable projection method for solving separable nonlinear least squares problem
 
     J = (1 - U Uᵀ) (dA/dn x - db/dn)
 
-which omits a term of the order of r and needs only products of dA/dn with the solution x.
+which omits a term of order r and needs only products of dA/dn with the solution x.
 """
 
 import functools
@@ -41,9 +41,9 @@ class LeastSquaresSolution(NamedTuple):
     x: np.ndarray
     """[P]."""
     rank: int
-    """Number of singular values above the tolerance; if below P, a combination of unknowns is undetermined."""
+    """Number of singular values above the tolerance. If it is below P, some combination of unknowns is undetermined."""
     condition: float
-    """Ratio of the largest to the smallest of these singular values; infinite if there are none."""
+    """Ratio of the largest to the smallest of these singular values; infinite without any."""
     residual: float
     """|A x - b|."""
 
@@ -63,17 +63,15 @@ def solve(
         ridge: dimensionless; with orthogonal columns it divides the unknowns by 1 + ridge.
         rank_tolerance: singular values below it, relative to the largest, count as zero; by default the rounding of
             the decomposition, 2.2e-16 max(N, P).
-        negligible: columns with a norm up to this fraction of the largest count as zero, so that rounding left by
-            cancelling terms is not scaled up to the size of the other columns.
+        negligible: columns with a norm below this fraction of the largest count as zero. This keeps rounding errors of
+            cancelling terms from being scaled up.
 
     Raises:
         InputError: numbers are not finite, the ridge is negative, or a tolerance is outside [0, 1).
     """
     A, b = np.asarray(A, np.float64), np.asarray(b, np.float64)
     if not (np.isfinite(A).all() and np.isfinite(b).all()):
-        raise InputError(
-            "the least-squares problem has NaN or infinite entries; expected finite ones: look at the data"
-        )
+        raise InputError("the least-squares problem has NaN or infinite entries; check the data")
     if not ridge >= 0:
         raise InputError(f"ridge is {ridge}; expected a number >= 0")
     if rank_tolerance is None:
@@ -103,7 +101,7 @@ def solve_chunks(
     rank_tolerance: float | None = None,
     negligible: float = 0.0,
 ) -> LeastSquaresSolution:
-    """Solves equations (A, b) that come in chunks of rows, holding one chunk at a time; arguments as for `solve`.
+    """Solves equations (A, b) given in chunks of rows, with one chunk in memory at a time; arguments as for `solve`.
 
     The chunks are folded into one triangle, [triangle; A b] = Q R, which has the same solutions and residual.
     """
@@ -114,7 +112,7 @@ def solve_chunks(
             A, b = np.concatenate([triangle[:, :-1], A]), np.concatenate([triangle[:, -1], b])
         triangle = triangular_factor(A, b)
     if triangle is None:
-        raise InputError("there are no equations to solve; expected at least one")
+        raise InputError("there are no equations; expected at least one")
     if rank_tolerance is None:
         rank_tolerance = float(np.finfo(np.float64).eps * max(rows, triangle.shape[1] - 1))
     return solve(triangle[:, :-1], triangle[:, -1], ridge=ridge, rank_tolerance=rank_tolerance, negligible=negligible)
@@ -136,7 +134,7 @@ def truncated_svd(A: np.ndarray, rank_tolerance: float) -> tuple[np.ndarray, np.
 
 
 def triangular_factor(A: Float[np.ndarray, "N P"], b: Float[np.ndarray, " N"]) -> Float[np.ndarray, "K P_and_1"]:
-    """Returns R [min(N, P + 1), P + 1] of [A b] = Q R, for which |A x - b| = |R (x, -1)| for every x."""
+    """Returns R [min(N, P + 1), P + 1] of [A b] = Q R; then |A x - b| = |R (x, -1)| for every x."""
     return np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))
 
 
@@ -156,7 +154,7 @@ class SeparableSolution(NamedTuple):
     G = [A, dA/dn x - db/dn] and s² = |A x - b|² / (N - rank - n); includes correlations between the two."""
     iterations: int
     converged: bool
-    """Whether the last iteration improved by no more than the limit, or not at all."""
+    """True if the last iteration improved by no more than the limit."""
 
 
 class _Projected(NamedTuple):
@@ -182,7 +180,7 @@ def solve_separable(
 
     Args:
         design: (n, *arguments) -> A [N, P] and b [N], in JAX; sample weights multiply their rows. Compiled once.
-        start: initial n [n]; pass positive quantities as logarithms.
+        start: initial n [n]; use logarithms for positive quantities.
         arguments: arrays, such as the data.
         improvement: stop if an iteration lowers the sum of squares by no more than this fraction.
         longest_step: largest step of a nonlinear unknown per iteration; damping shortens longer ones.
@@ -210,7 +208,7 @@ def solve_separable(
 
         at = project(n)
         if not np.isfinite(at.residual).all():
-            raise InputError("the equations have NaN or infinite entries at the start; expected finite ones")
+            raise InputError("the equations have NaN or infinite entries at the start; choose another start")
         damping, done, converged = FIRST_DAMPING, 0, False
         while done < iterations and not converged:
             J = np.asarray(slopes(n, at.x, *arguments))

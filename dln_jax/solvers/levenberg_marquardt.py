@@ -8,15 +8,15 @@ g = Jᵀr / N once, and tries dampings until one lowers F:
     x <- x + v + a,  or x + v where |a| > 0.75 |v|
 
 where s is the largest diagonal entry of the first A. Here a is the geodesic acceleration of Transtrum and Sethna (2012,
-arXiv:1201.5885), with the second derivative of r along v as a finite difference of step h. It takes a residual, a
-product and a solve with the same factor, and follows the curved valleys of networks: a two-link arm with 260 parameters
-reached a loss of 1e-8 in 24 to 34 iterations instead of 110 to 190. The damping is Nielsen's (1999, IMM-REP-1999-05):
-times max(1/3, 1 - (2 gain - 1)³) after a success, times 2, 4, 8, ... after successive failures, where gain is the
-decrease of F relative to that predicted by the quadratic model for v.
+arXiv:1201.5885), with the second derivative of r along v as a finite difference of step h. It takes one residual, one
+product and one solve with the same factor, and follows the curved valleys of network losses: a two-link arm with 260
+parameters reached a loss of 1e-8 in 24 to 34 iterations instead of 110 to 190. The damping follows Nielsen (1999,
+IMM-REP-1999-05): times max(1/3, 1 - (2 gain - 1)³) after a success, times 2, 4, 8, ... after successive failures. The
+gain is the actual decrease of F divided by the decrease that the quadratic model predicts for v.
 
-Normal equations square the condition number of J. They are solved by Cholesky if the damped matrix is regular in
-working precision, else by eigenvalues (`normal_equations.factorise`), which the state counts as a fallback. All
-functions are pure; the caller compiles them.
+Normal equations square the condition number of J. Cholesky solves them if the damped matrix is regular in working
+precision; otherwise eigenvalues do (`normal_equations.factorise`), which the state counts as a fallback. All functions
+are pure; the caller compiles them.
 
 The devices of a mesh share the samples: each sums J Jᵀ, J r, J w and |r|² over its samples, and all solve the same
 equations. Sums are reduced over devices once per iteration (P² / 2 numbers) and three times per trial (P + 2).
@@ -47,7 +47,8 @@ PROBE = 0.5
 CHUNK = 256
 """Number of samples whose Jacobian is evaluated at once."""
 KEPT_BYTES = 2**30
-"""Largest Jacobian kept through an iteration (see `jacobian_bytes`); beyond it, reverse mode gives its products."""
+"""Largest Jacobian kept in memory during an iteration (see `jacobian_bytes`); for larger ones, reverse mode gives its
+products."""
 TRIALS = 16
 """Steps tried before an iteration gives up."""
 
@@ -67,7 +68,7 @@ class Status(enum.IntEnum):
 
 
 class LevenbergMarquardtState(NamedTuple):
-    """Everything that the next iteration depends on: arrays, with a leading axis for several seeds."""
+    """State of an iteration: arrays, with a leading axis for several seeds."""
 
     parameters: Any
     """Tree of float64 arrays."""
@@ -89,7 +90,7 @@ class LevenbergMarquardtState(NamedTuple):
 
 
 def init(parameters: Any) -> LevenbergMarquardtState:
-    """Returns the state before the first iteration; its arrays are copies, so that a caller may donate them.
+    """Returns the state before the first iteration; its arrays are copies, so a caller may donate them.
 
     Raises:
         InputError: the parameters are not float64.
@@ -117,10 +118,11 @@ def run(
     *,
     improvement: float = 0.0,
 ) -> LevenbergMarquardtState:
-    """Runs `iterations` iterations, fewer if the status changes or one lowers F by no more than `improvement` F.
+    """Runs up to `iterations` iterations. Stops if the status changes or an iteration lowers F by at most `improvement`
+    F.
 
-    States with a leading axis of seeds run one after the other, not in lockstep: no seed repeats the failed trials of
-    another, memory is that of one seed, and LAPACK is never called for a batch (see `solvers.elimination`).
+    Several seeds run one after the other, not in lockstep: no seed repeats the failed trials of another, one seed is in
+    memory at a time, and LAPACK is never called for a batch (see `solvers.elimination`).
 
     Raises:
         InputError: parameters or residuals are not float64, or arrays differ in length.
@@ -162,7 +164,7 @@ def run_on_chunks(
     def on_one(shared: tuple[LevenbergMarquardtState, Array], chunks: Chunks) -> LevenbergMarquardtState:
         state, iterations = shared
         over_seeds = jax.vmap(run_one, in_axes=(0, None, None)) if state.iteration.ndim else run_one
-        # Devices may round the solution differently, so all continue from the first device's.
+        # Devices may round the solution differently, so all continue from the solution of the first.
         return first(over_seeds(state, chunks, iterations), mesh)
 
     return on_devices(on_one, mesh)((state, jnp.asarray(iterations)), chunks)
@@ -177,7 +179,7 @@ def _iterate(
     improvement: float,
     mesh: Mesh | None,
 ) -> LevenbergMarquardtState:
-    """Runs one iteration of one seed, whatever its status; loops and branches depend only on sums over all devices."""
+    """Runs one iteration of one seed at any status; loops and branches depend only on sums over all devices."""
     parameters = state.parameters
     x, unravel = ravel_pytree(parameters)
     rows = chunks.weights.size * equations.residual_count(sample_residual, parameters, chunks)
@@ -187,7 +189,7 @@ def _iterate(
     )
     matrix, gradient, squares = matrix / samples, gradient / samples, squares / samples
     largest = jnp.where(state.iteration == 0, jnp.max(jnp.diagonal(matrix)), state.scale)
-    # If no parameter has an effect, the scale is zero; any positive number will do, because the step is zero.
+    # If no parameter has an effect, the scale is zero. Any positive number works, because the step is zero.
     scale = jnp.where(largest > 0, largest, 1.0)
     finite = jnp.isfinite(squares) & jnp.all(jnp.isfinite(gradient))
     flat = jnp.all(gradient == 0)
@@ -203,8 +205,7 @@ def _iterate(
             """Returns v + a from the residuals at x + h v."""
             product = equations.pull_back(sample_residual, parameters, chunks, jacobian, probed, mesh=mesh)
             slope = product / samples
-            # Finite or NaN; the selection also keeps the rounding of the division, which a fused multiply-add would
-            # skip.
+            # Finite or NaN. The selection also keeps the rounding of the division; a fused multiply-add would skip it.
             slope = jnp.where(jnp.isfinite(slope), slope, jnp.nan)
             bend = -equations.solve(factor, slope - (1 - PROBE) * gradient + PROBE * damped * velocity) / PROBE**2
             bounded = bend @ bend <= UPPER_ACCELERATION**2 * (velocity @ velocity)  # False for NaN

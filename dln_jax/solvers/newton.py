@@ -3,8 +3,8 @@
     f(x, theta) = 0,    x <- x - J⁻¹ f,    J = df/dx        (Newton)
     dx = -J⁻¹ (df/dtheta) dtheta                            (implicit function theorem)
 
-The derivative is that of the root, not of the iterations: it costs one linear solve, in forward and in reverse mode and
-to any order, and is as accurate as the root.
+The derivative does not run through the iterations. It costs one linear solve, in forward and in reverse mode and to any
+order, and is as accurate as the root.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from dln_jax.types import InputError, require_positive
 
 Root = Float[Array, " n"]
 
-# A root that is correct to the last digit has a residual of about eps |J| |x|; evaluating f adds a few times that.
+# A root that is correct to the last digit has a residual of about eps |J| |x|; evaluating f adds a few times this.
 _ROUNDING_UNITS = 16
 
 
@@ -27,7 +27,7 @@ class SolverInfo(NamedTuple):
     """Outcome of a search for a root or a minimum."""
 
     residual: Float[Array, ""]
-    """Largest |f| at the last point judged: of the equations, or of the gradient in units of its scale."""
+    """Largest |f| at the last point: of the equations, or of the gradient in units of its scale."""
     iterations: Int[Array, ""]
     """Newton steps taken."""
     converged: Bool[Array, ""]
@@ -35,7 +35,7 @@ class SolverInfo(NamedTuple):
     definite: Bool[Array, ""] | None = None
     """Whether the Hessian at a minimum is positive definite (no saddle); `None` unless requested."""
     energy_noise: Float[Array, ""] | None = None
-    """Size of energy changes at a minimum that rounding hides, in the unit of the energy; `None` for a root."""
+    """Energy changes below this are lost in rounding at a minimum, in the unit of the energy; `None` for a root."""
     overflow: Bool[Array, ""] | None = None
     """Whether a list of moving elements was too short at a minimum; `None` without moving elements."""
     lists: tuple[Any, Any] = ((), ())
@@ -47,16 +47,16 @@ def find_root(
 ) -> tuple[Root, SolverInfo]:
     """Returns x [n] with function(x, *arguments) = 0, for up to about twenty equations and a start near the root.
 
-    There is no line search: from a start too far from the root the iteration may diverge, which `SolverInfo.converged`
-    reports; x is then the last iterate. Derivatives are those of the root, with respect to the arguments and to arrays
-    that the function closes over; the start has none.
+    There is no line search, so the iteration may diverge from a distant start. `SolverInfo.converged` reports that; x
+    is then the last iterate. The root can be differentiated by the arguments and by arrays that the function closes
+    over, not by the start.
 
     Args:
         function: (x [n], *arguments) -> f [n].
         start: first iterate [n].
         arguments: pytrees passed to the function.
-        tolerance: largest |f_i| that counts as zero, in the unit of f; rounding, 16 eps |J| |x|, always does. The
-            accepted point is improved by one more step, which about squares its error.
+        tolerance: largest |f_i| that counts as zero, in the unit of f; rounding, 16 eps |J| |x|, always does. One more
+            step improves the accepted point and roughly squares its error.
         iterations: largest number of Newton steps.
 
     Raises:
@@ -75,7 +75,7 @@ def find_root(
             return value, value
 
         def iterate(state: tuple[Array, ...]) -> tuple[Array, ...]:
-            # One evaluation per turn both judges the point and improves it, so that the function is compiled once.
+            # One evaluation per turn both tests and improves the point, so the function is compiled once.
             x, _, count, *_ = state
             jacobian, value = jax.jacfwd(twice, has_aux=True)(x)
             step = solve(jacobian, value)

@@ -2,7 +2,7 @@
 
 A problem is a function of ONE sample, `sample_residual(parameters, *sample) -> [r]`. For N samples and P parameters the
 Jacobian has N r rows; here it is J [P, rows], parameters first, because J Jᵀ multiplies fastest in this layout. Only
-one piece of it is alive at a time, unless the caller wants to keep it; `jacobian_bytes` returns the memory.
+one piece of it is in memory at a time, unless the caller keeps it; `jacobian_bytes` returns the memory.
 """
 
 from collections.abc import Callable
@@ -49,9 +49,9 @@ def count(parameters: Any) -> int:
 def jacobian_bytes(parameters: Any, samples: int, residuals: int, *, chunk_size: int, keep: bool) -> int:
     """Returns the bytes of the arrays that grow with the problem: 8 (4 P² + P chunk_size b + [P N r if kept]).
 
-    There are P parameters and N samples with r residuals. 4 P² is the matrix, its damped copy, its factor and a spare;
-    a piece of the Jacobian has b = 1 residual per sample in reverse mode (r < P), and b = r in forward mode.
-    Intermediate values of the residual function itself, for `chunk_size` samples, come on top.
+    There are P parameters and N samples with r residuals. 4 P² counts the matrix, its damped copy, its factor and a
+    spare. A piece of the Jacobian has b = 1 residual per sample in reverse mode (r < P), and b = r in forward mode.
+    Intermediate values of the residual function for `chunk_size` samples come on top.
     """
     size = count(parameters)
     piece = size * min(chunk_size, samples) * (1 if residuals < size else residuals)
@@ -63,8 +63,8 @@ def check_precision(tree: Any, what: str) -> None:
     others = {str(jnp.result_type(getattr(leaf, "dtype", leaf))) for leaf in jax.tree.leaves(tree)} - {"float64"}
     if others:
         raise InputError(
-            f"{what} are {', '.join(sorted(others))}; Gauss-Newton needs float64, for normal equations square the "
-            "condition number: set jax_enable_x64 (--precision f64) before arrays are made"
+            f"{what} are {', '.join(sorted(others))}; Gauss-Newton needs float64, because normal equations square "
+            "the condition number: set jax_enable_x64 (--precision f64) before creating arrays"
         )
 
 
@@ -140,7 +140,7 @@ def normal_equations(
 
         def add_residual(sums, residual):
             cotangent, values = residual
-            # Leaves are joined after the pull-back: the transpose of splitting a vector is a sum of padded ones.
+            # Leaves are joined after the pull-back: the transpose of splitting a vector is a sum of padded vectors.
             jacobian = jax.vmap(lambda pull: ravel_pytree(pull(cotangent)[0])[0], out_axes=-1)(pull_back)
             return add(sums, jacobian, values, weights)
 
@@ -206,9 +206,10 @@ def pull_back(
 def factorise(matrix: Float[Array, "P P"]) -> tuple[ScaledFactor, Array]:
     """Returns a factor of a symmetric matrix (lower triangle), and whether the fallback was needed.
 
-    A matrix whose Cholesky factor, scaled to unit diagonal, exists and has all L_ii² > P eps is solved unchanged. Else
-    it is singular to working precision: eigenvalues below P eps times the largest are raised to that, and L comes from
-    a QR decomposition, which leaves the other directions unchanged (Golub and Van Loan 2013, sections 4.2, 8.1).
+    If the matrix scaled to unit diagonal has a Cholesky factor with all L_ii² > P eps, it is solved unchanged.
+    Otherwise it is singular in working precision: eigenvalues below P eps times the largest are raised to this limit,
+    and L comes from a QR decomposition, which leaves the other directions unchanged (Golub and Van Loan 2013, sections
+    4.2, 8.1).
     """
     scaling = lax.rsqrt(jnp.diagonal(matrix))
     scaled = matrix * scaling * scaling[:, None]

@@ -99,7 +99,7 @@ def test_what_a_task_does_not_take_is_one_line(positions, capsys):
     assert_refused(capsys, train_hnn_task, rows, out=positions / "none")
     rows = {
         "--weight-decay 0.1": "unrecognised option: --weight-decay",
-        "--model pairwise-hnn": "positions of bodies",
+        "--model pairwise-hnn": "prismatic coordinates per body",
         "--steps 0": "steps is 0",
         "--seconds nan": "--seconds is nan",
         "--learning-rate 0.1": "an option of --optimizer adam",

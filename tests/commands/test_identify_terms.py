@@ -75,9 +75,9 @@ def test_terms_that_are_none_are_refused(folder, capsys):
     np.savez("cold.npz", **small_log(2))
     rows = [
         ("--motors 1,0", "--motors has 1 rows; expected 2"),
-        ("--motors 1,1;1,1", "that can be inverted"),
+        ("--motors 1,1;1,1", "expected an invertible matrix"),
         ("--coupled 1-2", "--coupled has '1-2'; expected pairs of joints such as 2:3"),
-        ("--coupled 1:3", "--coupled is 1:3; expected each pair of different joints"),
+        ("--coupled 1:3", "--coupled is 1:3; expected distinct pairs i:j of joints"),
         ("--friction coulomb,temperature", "temperature changes viscous friction"),
         ("--friction viscous,temperature", "friction is to depend on temperature, which the data do not have"),
     ]

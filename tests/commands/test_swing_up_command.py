@@ -48,7 +48,7 @@ def test_mistakes_are_one_line_and_leave_nothing(capsys, tmp_path):
         ("--actuated wrist", "no joint 'wrist'; the joints are 0 shoulder, 1 elbow"),
         ("--actuated 0,1", "all 2 joints have a motor"),
         ("no joint has a motor",),
-        ("--actuated elbow", "states no limit of the motor of joint 'elbow'"),
+        ("--actuated elbow", "has no limit for the motor of joint 'elbow'"),
         ("--actuated 1 --control -1", "control is [-1.0]"),
     ]
     file = two_links(tmp_path)

@@ -56,7 +56,7 @@ def test_settings_out_of_range_are_refused():
     for settings, message in (
         ({"rate": 0.0}, "rate is 0.0"),
         ({"hardware": Hardware(delay=-1)}, "delay is -1"),
-        ({"hardware": Hardware(encoder_noise=0.1)}, "give a key"),
+        ({"hardware": Hardware(encoder_noise=0.1)}, "give a jax.random key"),
     ):
         with one_line(message):
             simulated(COUNTING, **settings)

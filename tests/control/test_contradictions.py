@@ -22,10 +22,10 @@ BLOCK = TrajectoryProblem(
 def test_an_end_beyond_the_limits_is_refused():
     timed = {"end": lambda x, t: x[:1] - t, "knots": np.array([0.0, 0.5, 1.0])}
     for change, message in (
-        ({"end": lambda x: jnp.stack([x[1], x[0] - 1.0])}, "equation 1 of the end misses zero by 0.4 or more"),
-        ({"end": lambda x: jnp.stack([-2 * x[0] - 1.5])}, "equation 0 of the end misses zero by 0.3 or more"),
-        ({"end_below": lambda x: jnp.stack([x[1], 1.4 - 2 * x[0]])}, "inequality 1 of the end misses zero by 0.2 or"),
-        (timed, "equation 0 of the end misses zero by 0.4 or more"),
+        ({"end": lambda x: jnp.stack([x[1], x[0] - 1.0])}, "equation 1 of the end is at least 0.4 from zero"),
+        ({"end": lambda x: jnp.stack([-2 * x[0] - 1.5])}, "equation 0 of the end is at least 0.3 from zero"),
+        ({"end_below": lambda x: jnp.stack([x[1], 1.4 - 2 * x[0]])}, "inequality 1 of the end is at least 0.2"),
+        (timed, "equation 0 of the end is at least 0.4 from zero"),
     ):
         with one_line(message):
             require_end(BLOCK._replace(**change), 2, 1)
@@ -46,7 +46,7 @@ def test_contradictions_are_found_while_a_caller_traces():
     def traced(x, place):
         return shoot(BLOCK._replace(end=lambda x: x[:1] - place), x, np.zeros((3, 2)), np.zeros((2, 1)))
 
-    with one_line(r"misses zero by 0\.4"):
+    with one_line(r"is at least 0\.4"):
         jax.eval_shape(lambda x: traced(x, 1.0), np.zeros(2))
     with one_line("the start violates the upper limit of state 0 at knot 0 by 0.4"):
         jax.eval_shape(lambda: traced(np.array([1.0, 0.0]), 0.0))

@@ -179,5 +179,5 @@ def test_an_equation_of_the_end_holds_within_the_width_of_its_price():
 
 
 def test_a_free_first_state_is_refused():
-    with one_line("in real time it is measured"):
+    with one_line("it is measured in real time"):
         improve(BLOCK._replace(free=np.array([True, False])), first_plan(BLOCK, START, IDLE))

@@ -64,7 +64,7 @@ def test_models_that_cannot_be_used_are_refused():
         (InverseForward(*NOMINAL[:2]), "has no energy"),
         (dynamics(indefinite), "not positive definite"),
         (with_potential(lambda q: 0.1 * q[1]), "no equilibrium near the goal"),
-        (with_potential(lambda q: 0.2 * q[0]), "do not hold the goal"),  # the motor is too weak
+        (with_potential(lambda q: 0.2 * q[0]), "outside the limits"),  # the motor is too weak
     ):
         with one_line(message):
             upright_of(model, LAYOUT)

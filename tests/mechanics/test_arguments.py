@@ -25,7 +25,7 @@ def without_numpy(q, qd):
 
 def test_states_of_another_size_are_refused():
     for energy, size, message in [
-        (pendulums, 1, "takes no states of size 1 .*out of bounds"),
+        (pendulums, 1, "does not take states of size 1 .*out of bounds"),
         (pendulums, 3, "does not depend on coordinate 2"),
         (without_numpy, 4, "does not depend on coordinate 2, 3"),
     ]:
@@ -41,8 +41,8 @@ def test_states_that_fit_are_taken():
 
 def test_an_energy_that_is_wrong_in_itself_is_not_blamed_on_the_state():
     for energy, message in [
-        (lambda q, qd: 0.5 * qd @ qd - jnp.cos(q[:1]), r"no scalar \(Gradient only .* had shape: \(1,\)\)"),
-        (lambda q, qd: None, "an energy of the system is no scalar"),
+        (lambda q, qd: 0.5 * qd @ qd - jnp.cos(q[:1]), r"not a scalar \(Gradient only .* had shape: \(1,\)\)"),
+        (lambda q, qd: None, "an energy of the system is not a scalar"),
         (lambda q, qd: 0.5 * np.dot(np.asarray(qd), np.asarray(qd)), "NumPy or Python numbers .*; use jax.numpy"),
         (lambda q, qd: 0.5 * qd @ qd + (q[0] if q[0] > 0 else 0.0), "NumPy or Python numbers"),
         (lambda q, qd, shape: 0.5 * qd @ qd, "missing 1 required positional argument: 'shape'"),
@@ -62,5 +62,5 @@ def test_masses_may_be_traced_and_do_not_hide_a_state_that_is_too_short():
     np.testing.assert_allclose(jax.grad(torque)(3.0), slope, rtol=1e-5)
     np.testing.assert_allclose(jax.jit(torque)(3.0), 3 * slope, rtol=1e-5)
     np.testing.assert_allclose(jax.vmap(torque)(jnp.full(3, 3.0)), 3 * slope, rtol=1e-5)
-    with one_line("takes no states of size 1"):
+    with one_line("does not take states of size 1"):
         jax.grad(lambda mass: torque(mass, size=1))(2.0)

@@ -85,7 +85,7 @@ def test_what_a_model_cannot_have_is_refused():
         ("trigonometric", ("load",), "the model is not linear in its parameters; leave load out"),
         ("structured-delan", ("rust",), r"joint_friction: \('rust',\); expected a tuple of viscous"),
         ("polynomial-hamiltonian", ("viscous",), "conserves energy"),
-        ("pairwise-hnn", ("viscous",), "without friction"),
+        ("pairwise-hnn", ("viscous",), "no friction"),
     ]:
         needs = Needs(joints=("prismatic",) * 4 if kind == "pairwise-hnn" else ("revolute",) * 2)
         description = describe(kind, needs=needs, precision="f64")

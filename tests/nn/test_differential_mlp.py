@@ -135,9 +135,9 @@ def test_wrong_states_layers_and_sizes_are_refused():
         with one_line("expected one network"):
             value(layers, x, activation=GELU)
     members = jax.tree.map(lambda leaf: leaf[None], (first, last))
-    with one_line(r"ensemble need jax\.vmap"):
+    with one_line(r"jax\.vmap for an ensemble"):
         value_and_jacobian(members, x, activation=GELU)
-    with one_line("1 member; its spread needs two"):
+    with one_line("1 member; a spread needs at least 2"):
         differential_mlp.mean_and_spread(partial(value, activation=GELU), members, x)
     for sizes in ((), (2,), (2, 0, 1)):
         with one_line("sizes are"):

@@ -26,7 +26,7 @@ def test_no_options_of_the_cpu_reach_another_compiler(on_gpu, monkeypatch):
 
 
 def test_low_latency_mode_is_refused_with_the_reason(on_gpu):
-    with pytest.raises(InputError, match=r"is for the CPU, and JAX computes on gpu.*export C"):
+    with pytest.raises(InputError, match=r"is for the CPU, but JAX computes on gpu.*export C"):
         low_latency(jnp.sin, np.zeros(2))
     before = getattr(jax.config, "jax_platforms")  # noqa: B009
     jax.config.update("jax_platforms", "cuda,cpu")

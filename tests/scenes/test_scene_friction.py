@@ -26,7 +26,7 @@ def test_forces_are_those_of_the_formulas():
 
 def test_mistakes_are_one_line():
     for coefficients, message in [
-        (FrictionCoefficients(), "no friction to add"),
+        (FrictionCoefficients(), "all friction coefficients are zero"),
         (FrictionCoefficients(sigmoid=1.0), "no sigmoid friction"),
         (FrictionCoefficients(coulomb=-1.0), "coulomb is -1"),
     ]:

@@ -246,13 +246,13 @@ def test_mistakes_of_actuators_say_what_is_wrong():
     for mistake, words in (
         (lambda: pressure(mesh, wall[1:]), "open at 2 vertices, the first is vertex 1"),
         (lambda: pressure(quadratic(mesh), wall[1:]), r"or use linear elements \(order 1\)"),
-        (lambda: pressure(mesh, [[0, 99]]), "facet 0 is .0, 99.; expected 2 different ones of 0..15"),
+        (lambda: pressure(mesh, [[0, 99]]), "facet 0 is .0, 99.; expected 2 different vertices of 0..15"),
         (lambda: pressure(mesh, [[0, 1], [1, 0]]), "is repeated"),
         (lambda: inner_surface(cube), "no closed cavity"),
         (lambda: facets_in(named, "few"), "'few' contains no edge of the surface"),
         (lambda: tendon_of_tension(mesh, [[0.7, 0.0], [3.0, 0.0]], tension=1.0), "point 1 at .3.0, 0.0. m is outside"),
         (lambda: tendon_of_tension(mesh, [0, 0], tension=1.0), "points 0 and 1 of the path coincide"),
-        (lambda: fibres(mesh, (0.0, 0.0), strength=1.0), "direction of fibres 0 has no length"),
+        (lambda: fibres(mesh, (0.0, 0.0), strength=1.0), "direction of fibres 0 is zero"),
         (lambda: traction(mesh, surface_parts(mesh)[0], [1.0, 2.0, 3.0]), "has shape .3.; expected .2."),
         (lambda: gas(mesh, wall, pressure=-2e5), "absolute pressure"),
     ):

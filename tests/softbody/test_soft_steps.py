@@ -183,7 +183,7 @@ def test_states_that_do_not_fit_are_refused():
     assert two_steps.init().previous is not None and init().previous is None
     for mistake, words in (
         (lambda: init(x=np.where(np.arange(4)[:, None] == 2, np.nan, MESH.vertices)), "x of vertex 2 is not finite"),
-        (lambda: two_steps.step(held_body().params, init(), None), "no room for the state before"),
+        (lambda: two_steps.step(held_body().params, init(), None), "no previous state"),
         (lambda: make_step(held_body(), DT, BDF2, halvings=2), "halvings"),
         (lambda: rollout(lambda state, _: (state, None), jnp.zeros(1)), "neither inputs nor steps"),
         (lambda: rollout(lambda state, _: (state, None), 0.0, steps=6, segment=4), "segment is 4 for 6 steps"),
@@ -209,7 +209,7 @@ def test_what_does_not_fit_a_scene_is_refused():
         ({"held": [0, N]}, f"held names vertex {N}; expected 0..{N - 1}"),
         ({"held": [-1]}, "held names vertex -1"),
         ({"held": [1, 2, 1]}, "held names a vertex twice"),
-        ({"held": np.ones(N, bool)}, "at least one that is free"),
+        ({"held": np.ones(N, bool)}, "at least one free vertex"),
         ({"masses": 1.0, "density": 500.0}, "masses and density"),
     ):
         with one_line(words):

@@ -106,13 +106,13 @@ def test_the_momentum_of_robot_and_body_grows_by_the_impulse_on_the_robot():
 def test_what_a_robot_cannot_carry_is_refused():
     scene = carried()
     for settings, words in (
-        ((scene._replace(held=np.arange(0)), 1e-2, at_tip, pendulum), "holds no vertex"),
-        ((scene, 1e-2, at_tip, pendulum, MIDPOINT), "ends where forces balance"),
+        ((scene._replace(held=np.arange(0)), 1e-2, at_tip, pendulum), "has no held vertex"),
+        ((scene, 1e-2, at_tip, pendulum, MIDPOINT), "ends in a balance of forces"),
     ):
         with one_line(words):
             make_tied_step(*settings)
     with one_line(r"carry returned positions of shape \(2, 2\)"):
         make_tied_step(scene, 1e-2, lambda q, x: at_tip(q, x[:2]), pendulum).init([0.0])
     init, step = make_tied_step(scene, 1e-2, at_tip, pendulum)
-    with one_line("which the robot carries"):
+    with one_line("but the robot moves them"):
         step(scene.params, init([0.0]), None, Motion(held=FINGER.vertices[scene.held]))

@@ -10,10 +10,10 @@ held and the trapezoidal rule for beta = dL/dq - friction,
 
     r <- r + (1 - exp(-gain dt)) ((p' - p) / dt - tau - (beta + beta') / 2 - r)
 
-A push shows when r leaves the band of the model's own errors. The score of a sample is the largest |r_i| / band_i, with
-the standard deviation band_i of r without contact: the model's torque band, for example `Run.torque_std` at this state,
-or the root mean square of r in motions without contact. `contact_threshold` finds the score that motions without
-contact exceed only as often as allowed.
+A contact is detected when r leaves the band of the model errors. The score of a sample is the largest |r_i| / band_i.
+band_i is the standard deviation of r without contact: the torque band of the model, for example `Run.torque_std` at
+this state, or the root mean square of r in motions without contact. `contact_threshold` returns the score that motions
+without contact exceed at the allowed rate.
 """
 
 import math
@@ -31,7 +31,7 @@ from dln_jax.solvers.elimination import symmetric_eigen
 from dln_jax.types import InputError, Scalar, Vector, require_positive
 
 BLOCK = 1.0
-"""Length of the blocks whose largest scores are fitted, s."""
+"""Length of the blocks for the distribution of largest scores, s."""
 LEAST_BLOCKS = 20
 """Fewest blocks for a fit."""
 
@@ -44,16 +44,16 @@ def momentum_observer(model: Dynamics | InverseForward, d: int, *, rate: float, 
     """Returns a momentum observer of a natural system.
 
     Args:
-        model: known or learned, with an energy; its friction counts as known.
+        model: known or learned, with an energy; its friction is taken as exact.
         d: number of coordinates.
         rate: sampling rate, Hz.
-        gain: gain of the residual, 1/s, one for all or one per joint; 1 / gain is the time constant.
+        gain: gain of the residual, 1/s, one for all or one per joint: the inverse of the time constant.
 
     Raises:
         InputError: the model has no energy, or a number is not positive.
     """
     if not isinstance(model, Dynamics):
-        raise InputError("the model has no energy, which a momentum observer needs; train a DeLaN, for example")
+        raise InputError("the model has no energy, and a momentum observer needs one; train a DeLaN, for example")
     require_positive(d=d, rate=rate)
     for number in np.ravel(gain):
         require_positive(gain=float(number))
@@ -86,11 +86,11 @@ def contact_threshold(scores: Any, *, rate: float, false_alarms: float) -> float
     """Returns the score that motions without contact exceed at a stated rate.
 
     The largest scores in blocks of a second follow a generalised extreme value law, fitted by its probability-weighted
-    moments (Hosking, Wallis and Wood 1985). It extrapolates to alarms that are rarer than one per recording. Alarms
-    within a block count once.
+    moments (Hosking, Wallis and Wood 1985). The law extrapolates to alarms rarer than one per recording. Alarms within
+    a block count once.
 
     Args:
-        scores: [N], of motions without contact like those to come; or a list of such recordings.
+        scores: [N], from motions without contact like the later ones; or a list of such recordings.
         rate: sampling rate, Hz.
         false_alarms: allowed number per hour.
 
@@ -132,14 +132,14 @@ def flange_wrench(
 ) -> tuple[Float[Array, " 6"], Bool[Array, ""], Scalar]:
     """Returns the wrench F at a flange as the least-squares solution of Jᵀ F = tau, in the ground frame.
 
-    The first three components are the force, N, the others the moment about the flange's point, N m. The second result
-    tells whether the torques determine all six of them; otherwise this is the shortest wrench that explains them. The
-    third is the norm of the torques that no wrench at the flange explains, N m or N: a contact elsewhere.
+    The first three components are the force, N, and the others the moment about the flange's point, N m. The second
+    result is true if the torques determine all six components; otherwise F is the shortest solution. The third is the
+    norm of the unexplained torques, N m or N. A large norm means a contact elsewhere.
 
     Args:
         jacobian: Jacobian of the flange's linear and angular velocity [6, d], by `frame_jacobian`.
         tau: external torques [d].
-        length: length that makes moments comparable with forces, m.
+        length: length that scales moments to forces, m.
         smallest: singular values of the scaled Jacobian below this share of the largest count as zero.
     """
     jacobian, tau = jnp.asarray(jacobian), jnp.asarray(tau)

@@ -1,10 +1,10 @@
-"""Kalman filters of one state: `predict` and `update` a belief by a process with random disturbances and measurements.
+"""Kalman filters for one state: `predict` and `update` a belief, given a process with disturbances and noise.
 
     x' = step(x, u, w),   w ~ N(0, disturbance²),      y = measured(x) + v,   v ~ N(0, noise²)
 
-For a mechanical system x = (q, qd), and w is a torque that the model lacks, held for a sample: friction, model errors,
-a push. Its standard deviation is the model's torque band. An encoder with step s rounds q, which adds the variance
-s² / 12.
+For a mechanical system x = (q, qd), and w is an unmodelled torque, held for a sample: friction, model errors, a push.
+Its standard deviation is the torque band of the model. An encoder with step s rounds q, which adds the variance s² /
+12.
 
 The extended filter linearises the process at the estimate, by forward-mode derivatives:
 
@@ -14,7 +14,7 @@ The unscented filter evaluates it at points of the belief, without derivatives. 
 root of the covariance of (x, w), the 2 N points mean +- √N s_j have the weight 1 / (2 N) each (Julier and Uhlmann 1997
 with kappa = 0; Arasaratnam and Haykin 2009, "Cubature Kalman filters"). It is exact to second order. Weights are
 positive, so a triangular factor of the scaled differences is a square root of the covariance. For a linear process both
-are the Kalman filter.
+equal the Kalman filter.
 """
 
 import math
@@ -40,11 +40,11 @@ class Process(NamedTuple):
     measured: Callable[[Array], Array]
     """x -> y [p]."""
     disturbance: Any
-    """Standard deviation of w [k], or a function (x, u) -> [k] such as a learned model's torque band."""
+    """Standard deviation of w [k], or a function (x, u) -> [k] such as the torque band of a learned model."""
     noise: Any
     """Standard deviation of v [p], above zero."""
     unscented: bool = False
-    """Whether filters evaluate the process at points of the belief, instead of linearising it."""
+    """True: filters evaluate the process at points of the belief. False: they linearise it."""
 
     def deviation(self, x: Array, u: Array) -> Array:
         """Returns the standard deviation of w [k] at a state."""
@@ -60,10 +60,10 @@ class Belief(NamedTuple):
 
 
 class Innovation(NamedTuple):
-    """The part of a measurement that was not predicted: independent normal residuals if the process is right."""
+    """Unpredicted part of a measurement: independent normal residuals for a correct process."""
 
     residual: Float[Array, " p"]
-    """Measurement minus its prediction from all earlier ones, channel by channel; 0 if unseen."""
+    """Measurement minus its prediction from all earlier measurements, channel by channel; 0 if unseen."""
     variance: Float[Array, " p"]
     """Predicted variance of the residual; 1 if unseen."""
     seen: Bool[Array, " p"]
@@ -79,15 +79,15 @@ def mechanical(
     encoder_noise: Any = 0.0,
     substeps: int = 1,
 ) -> Process:
-    """Returns the process of a mechanical system whose coordinates q are measured.
+    """Returns the process of a mechanical system with measured coordinates q.
 
     Args:
         model: known or learned.
         actuation: matrix [d, m] in tau = actuation u; by default every coordinate has its own motor.
         rate: sampling rate, Hz.
-        band: standard deviation of the torques that the model lacks [d], N m or N, or (x, u) -> [d].
+        band: standard deviation of the unmodelled torques [d], N m or N, or (x, u) -> [d].
         encoder_step: resolution of the coordinates [d], or one for all, rad or m.
-        encoder_noise: standard deviation of other noise of the coordinates [d], or one for all, rad or m.
+        encoder_noise: standard deviation of additional noise [d], or one for all, rad or m.
         substeps: integrator steps per sample.
 
     Raises:
@@ -96,7 +96,7 @@ def mechanical(
     require_positive(rate=rate)
     noise = np.sqrt(np.asarray(encoder_step, float) ** 2 / 12 + np.asarray(encoder_noise, float) ** 2)
     if not (noise > 0).all():
-        raise InputError("a coordinate has neither encoder_step nor encoder_noise; expected one of them above zero")
+        raise InputError("a coordinate has neither encoder_step nor encoder_noise; expected one of them positive")
     if not callable(band) and not (np.asarray(band, float) >= 0).all():
         raise InputError(f"band is {np.asarray(band).tolist()}; expected standard deviations of 0 or more")
     B = None if actuation is None else jnp.asarray(actuation, float)
@@ -143,7 +143,7 @@ def predict(process: Process, belief: Belief, u: Array) -> Belief:
 
 
 def update(process: Process, belief: Belief, y: Array, seen: Any = True) -> tuple[Belief, Innovation]:
-    """Returns the belief with measurements y [p], and the innovation; channels that are not seen [p] are ignored.
+    """Returns the belief with measurements y [p], and the innovation; channels with `seen` [p] false are ignored.
 
     The measurements y = predicted + slopes z + v with x = mean + W z, z ~ N(0, 1), are added one channel after the
     other, in Potter's square-root form (Bierman 1977, "Factorization methods for discrete sequential estimation",
@@ -158,7 +158,7 @@ def update(process: Process, belief: Belief, y: Array, seen: Any = True) -> tupl
         above, below = (jax.vmap(process.measured)(x + sign * reach * W.T) for sign in (1.0, -1.0))
         predicted = jnp.mean((above + below) / 2, axis=0)
         slopes = (above - below).T / (2 * reach)
-        # Curvature of the measurement counts as noise: the part of its variance that no slope explains.
+        # Curvature of the measurement counts as noise: the part of its variance beyond the slopes.
         variance += jnp.mean(((above + below) / 2 - predicted) ** 2, axis=0)
     else:
         predicted = process.measured(x)
@@ -188,7 +188,7 @@ def filtered(
         belief: belief in the state before the first measurement.
         y: measurements.
         u: controls that act from each sample to the next.
-        seen: which channels have a measurement at a sample, [N, p], [p] or one for all.
+        seen: True for channels with a measurement at a sample, [N, p], [p] or one for all.
     """
     y = jnp.asarray(y)
     seen = jnp.broadcast_to(jnp.asarray(seen, bool), y.shape)
@@ -210,14 +210,14 @@ def consistency(innovation: Innovation) -> Scalar:
 def _triangular(A: Float[Array, "n m"]) -> Float[Array, "n n"]:
     """Returns the lower triangular L with L Lᵀ = A Aᵀ, m >= n, by the modified Gram-Schmidt process on the rows.
 
-    It never forms A Aᵀ, whose condition number is squared (Golub and Van Loan 2013, section 5.2.8). A row that depends
-    on those above it has a zero on the diagonal.
+    It never forms A Aᵀ, which would square the condition number (Golub and Van Loan 2013, section 5.2.8). A row that
+    depends on the rows above it gets a zero on the diagonal.
     """
     columns = []
     for row in range(len(A)):
         size = jnp.sqrt(A[row] @ A[row])
         unit = A[row] / jnp.where(size > 0, size, 1.0)
-        # Rows above this one are done; they are orthogonal to it up to rounding, which is left out.
+        # Rows above are finished; they are orthogonal to this one up to rounding, which is ignored.
         column = jnp.where(jnp.arange(len(A)) >= row, A @ unit, 0.0)
         A = A - column[:, None] * unit
         columns.append(column)

@@ -1,6 +1,6 @@
-"""Noise of a process from a log: the values that make its measurements most probable.
+"""Noise of a process from a log, by maximum likelihood.
 
-For a filter whose innovations r have the predicted variances S, the negative logarithm of the likelihood of a log is
+For innovations r with predicted variances S, the negative logarithm of the likelihood of a log is
 
     sum over samples and channels of  ½ (r² / S + log 2 pi S)
 
@@ -24,7 +24,7 @@ from dln_jax.mechanics.dynamics import Dynamics, InverseForward
 from dln_jax.types import InputError, Scalar
 
 SAMPLES = 4000
-"""Number of samples of a log that are used, equally many from the start of every trajectory."""
+"""Number of samples taken from a log, equally many from the start of every trajectory."""
 FIRST_RATE = 1.0
 """Standard deviation of the first rates, 1/s or m/s."""
 DIFFERENCE = 1e-3
@@ -36,7 +36,7 @@ ITERATIONS = 30
 
 
 def tuned(process: Process, logs: list[tuple[Belief, Any, Any]]) -> Process:
-    """Returns the process with the disturbance that makes logs most probable.
+    """Returns the process with the most likely disturbance for the logs.
 
     Args:
         process: with first values above zero.
@@ -49,9 +49,9 @@ def tuned(process: Process, logs: list[tuple[Belief, Any, Any]]) -> Process:
 
     first = np.asarray([] if callable(process.disturbance) else process.disturbance, float).ravel()
     if not logs or not len(first) or not (first > 0).all():
-        raise InputError("tuning needs a log, and a constant first disturbance above zero in every torque")
+        raise InputError("tuning needs a log, and a positive constant first disturbance of every torque")
     count = sum(np.size(y) for _, y, _ in logs)
-    # All logs are filtered together; shorter ones end with samples that are not seen.
+    # All logs are filtered together; shorter logs end with unseen samples.
     longest = max(len(y) for _, y, _ in logs)
 
     def filled(rows: Any) -> np.ndarray:
@@ -71,7 +71,7 @@ def tuned(process: Process, logs: list[tuple[Belief, Any, Any]]) -> Process:
     probes = DIFFERENCE * np.concatenate([np.zeros((1, len(first))), np.eye(len(first)), -np.eye(len(first))])
 
     def cost(theta: np.ndarray) -> tuple[float, np.ndarray]:
-        # Derivatives through the filter would take several times longer to compile than these differences to compute.
+        # Compiling derivatives through the filter would take several times longer than computing these differences.
         values = np.asarray(surprise(jnp.asarray(theta + probes), together), float)
         above, below = np.split(values[1:], 2)
         return float(values[0]), (above - below) / (2 * DIFFERENCE)
@@ -95,15 +95,15 @@ def from_log(
 ) -> Process:
     """Returns the process of a model with the noise of a log of encoders and torques.
 
-    The noise of the coordinates is that of the encoder analysis, at least step / √12. The torque band starts at a
-    hundredth of the torques' range and is tuned.
+    The encoder analysis gives the noise of the coordinates, at least step / √12. The torque band starts at a hundredth
+    of the range of the torques and is then tuned.
 
     Args:
         model: known or learned.
-        log: t, q and tau, which is held from each sample to the next; steps need not be equal.
-        actuation: matrix [d, m] of the process that is returned.
+        log: t, q and tau; tau is held from each sample to the next, and the steps may differ.
+        actuation: matrix [d, m] of the returned process.
         substeps: integrator steps per sample.
-        delay: samples after which the log's torques act.
+        delay: delay of the log's torques in samples.
 
     Raises:
         InputError: the log has no motion, or trajectories of fewer than eight samples.
@@ -113,7 +113,7 @@ def from_log(
     noise = noise_of(log.q, np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces]))
     if not (np.isfinite(noise).all() and (noise > 0).all()):
         raise InputError(
-            f"the noise of q in the log is {noise.tolist()}; expected coordinates that move, in eight samples or more"
+            f"the noise of q in the log is {noise.tolist()}; expected moving coordinates and at least 8 samples"
         )
     make = partial(mechanical, model, rate=rate, encoder_noise=noise, substeps=substeps)
     first = make(band=np.full(log.q.shape[1], 0.01 * max(float(np.ptp(log.tau)), 1e-300)))

@@ -1,10 +1,10 @@
-"""Convex costs of controls, whose conjugates give the optimal control in closed form (Lutter, Belousov et al. 2019).
+"""Convex costs of controls with conjugates that give the optimal control (Lutter, Belousov et al. 2019).
 
     g*(w) = max_u wᵀu - g(u),   attained at u = grad g*(w)
 
 With the cost to go V, dynamics a + B u and cost q + g, the optimal control is u = grad g*(-Bᵀ dV/dx). A cost that is
-infinite beyond limits keeps the control within them. An `ActionCost` of your own is three functions; the documentation
-lists those of the paper's table 1.
+infinite beyond limits keeps the control within them. Write your own `ActionCost` as three functions; the documentation
+lists table 1 of the paper.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ class ActionCost(NamedTuple):
 
 
 def quadratic(R: Any) -> ActionCost:
-    """Returns ½ uᵀ R u, for unlimited controls, which are linear in w.
+    """Returns ½ uᵀ R u, for unlimited controls that are linear in w.
 
     Args:
         R: symmetric, positive definite [m, m], or one number for all controls.
@@ -63,21 +63,21 @@ def stretched(cost: ActionCost, a: Any) -> ActionCost:
 
 
 def centred(cost: ActionCost, u: Any) -> ActionCost:
-    """Returns g minus its tangent at u0: minimal and zero at the control u0 that holds a goal, within the same limits.
+    """Returns g minus its tangent at u0, which is zero and minimal at the holding control u0, within the same limits.
 
     Args:
         cost: g, with a slope at u0.
         u: u0 [m].
 
     Raises:
-        InputError: the policy of g does not return u0, which may be out of its range.
+        InputError: the policy of g does not return u0, for example because u0 is out of range.
     """
     u = jnp.asarray(u, float)
     slope = jax.grad(cost.cost)(u)
     if not bool(jnp.max(jnp.abs(cost.policy(slope) - u)) <= 1e-6 * (1 + jnp.max(jnp.abs(u)))):
         raise InputError(
-            f"the limits cannot hold the goal: it takes the control {np.asarray(u).tolist()}, which is out of the "
-            "range of the action cost; give wider limits, or another goal"
+            f"the limits cannot hold the goal: it takes the control {np.asarray(u).tolist()}, out of the range of the "
+            "action cost; give wider limits, or another goal"
         )
     offset = cost.cost(u) - slope @ u
     return ActionCost(

@@ -5,12 +5,12 @@ trajectory, costs are added up with exponential weights (Lutter et al. 2021, arX
 
     G_k = c_k + e^(-rho dt) [(1 - w) V(x_{k+1}) + w G_{k+1}],    G_N = V(x_N),    w = e^(-dt / memory)
 
-so all states on the way have a target, not only the first. They also have a target for the slope p_k = dG_k/dx, by the
+so every state on the way has a target, not only the first. It also has a target for the slope p_k = dG_k/dx, by the
 chain rule through the closed loop, including the policy. With fixed controls, as in the costate of Pontryagin's
-principle, slopes of an unstable plant would grow backwards wherever the controls are not yet optimal. With a long
-memory the targets are the policy's own cost, whose excess over the optimum is quadratic in the policy's error, and the
-iteration is Howard's policy iteration, which converges like Newton's method. With a short one they are n-step returns,
-which do not require a good policy.
+principle, the slopes of an unstable plant would grow backwards while the controls are not optimal. With a long memory
+the targets are the policy's own cost. Its excess over the optimum is quadratic in the error of the policy, and the
+iteration is Howard's policy iteration, which converges like Newton's method. With a short memory the targets are n-step
+returns, which do not require a good policy.
 """
 
 import functools
@@ -55,24 +55,24 @@ class Iteration(NamedTuple):
     dt: float = 0.02
     """Time step, s."""
     memory: float = 3.0
-    """Memory in the last iteration, s; infinite for the policy's own cost."""
+    """Memory in the last iteration, s; infinite for the cost of the policy itself."""
     first_memory: float = 0.3
     """Memory in the first iteration, s."""
     kept: int = 8
-    """States per trajectory that are fitted: the first, and others with growing distance."""
+    """Fitted states per trajectory: the first, and others at growing distances."""
     steps: int = 200
     """Adam steps per iteration."""
     batch: int = 1024
     learning_rate: float = 1e-2
     """Peak; it decays by a cosine over all iterations."""
     slope_weight: float = 0.05
-    """Weight of the slopes' misfit, in units of the box, relative to that of the values."""
+    """Weight of the misfit of slopes, in units of the box, relative to the misfit of values."""
     floor: float = 0.02
-    """Share of the 90 % quantile of the targets that is added to every target in relative misfits."""
+    """Offset of the targets in relative misfits, as a share of their 90 % quantile."""
     followed: float = 2.0
-    """Duration of runs in validation, in units of `seconds`; V stands for the costs after it."""
+    """Duration of validation runs, in units of `seconds`; V approximates the later costs."""
     margin: float = 1.25
-    """Factor on the box for drawing states and clipping trajectories; 1 as published, but then the edges of the box
+    """Factor on the box for drawing states and clipping trajectories. The published value 1 lets the edges of the box
     affect the value inside."""
 
 
@@ -95,7 +95,7 @@ def fit_values(
     restore: Callable[[int, Any], tuple[Any, list[ValueProgress]] | None] = lambda seed, like: None,
     store: Callable[[int, Any, list[ValueProgress]], None] = lambda seed, state, history: None,
 ) -> list[ValueFit]:
-    """Runs the iterations for several seeds, one after the other, with a program that is compiled once.
+    """Runs the iterations for several seeds, one after the other, in a program compiled once.
 
     The parameters of a seed are the best on separate validation states.
 
@@ -105,16 +105,16 @@ def fit_values(
         seeds: seeds of parameters and states.
         numbers: settings of the iteration.
         parameters: initial parameters; random by default.
-        double: whether to compute in float64, which takes twice as long.
+        double: compute in float64, which takes twice as long.
         disturbance: worst-case disturbance, for a robust value.
-        mesh: devices that share the policy's runs; all devices do the whole fits.
+        mesh: devices that share the runs of the policy; every device does the whole fit.
         report: called with the seed after every iteration.
-        restore: (seed, first state) -> the state and history to resume from with the same bits, or `None`. A state is a
-            tree of the parameters, the optimiser's state and the best parameters.
+        restore: (seed, first state) -> state and history for an exact resumption, or `None`. A state is a tree of the
+            parameters, the optimiser's state and the best parameters.
         store: called with the seed, its state and its history after every iteration.
 
     Raises:
-        InputError: a number is out of range, or the cost of the policy was never finite.
+        InputError: a number is out of range, or the cost of the policy is never finite.
     """
     require_positive(**{name: number for name, number in numbers._asdict().items() if name != "slope_weight"})
     wide = widened(problem, numbers.margin)
@@ -145,7 +145,7 @@ def fit_values(
             for number in range(len(history), numbers.iterations):
                 grown = number / max(numbers.iterations - 1, 1)
                 memory = jnp.asarray(numbers.first_memory ** (1 - grown) * numbers.memory**grown)
-                with held_back():  # an interrupt inside of XLA is lost, or ends the process by SIGABRT
+                with held_back():  # an interrupt inside XLA is lost, or ends the process by SIGABRT
                     current, state, loss = advance(current, state, jax.random.fold_in(key, 2 + number), memory)
                     score = float(judge(current, validated))
                     if score < lowest:
@@ -156,7 +156,7 @@ def fit_values(
                 report(seed, history[-1])
             if not math.isfinite(lowest):
                 raise InputError(
-                    "the cost of the policy was never finite; take a smaller dt, or a box that it can stay near"
+                    "the cost of the policy was never finite; use a smaller dt, or a box that the policy can stay near"
                 )
             return ValueFit(local(best, mesh), lowest, history, history[-1].seconds, compile_seconds)
 
@@ -166,7 +166,7 @@ def fit_values(
 def greedy(
     problem: ControlProblem, value: ValueAndGradient, dt: float, disturbance: Disturbance | None = None
 ) -> Callable[[Array], tuple[Array, Scalar]]:
-    """Returns x -> state after a step under the value's policy, and the step's cost, under the disturbance if any."""
+    """Returns x -> state after a step of the greedy policy, and its cost, with the disturbance if any."""
     step = flow(problem, dt, clipped=True)
 
     def closed(x: Array) -> tuple[Array, Scalar]:
@@ -235,7 +235,7 @@ def _iteration(
         value = lambda x: network.value_and_gradient(parameters, x)  # noqa: E731
         return targets(problem, value, x, steps=steps, dt=numbers.dt, memory=memory, disturbance=disturbance)
 
-    # Devices share the trajectories; all of them do the whole fit.
+    # Devices share the trajectories; every device does the whole fit.
     trajectories = spread(lambda shared, x: jax.vmap(functools.partial(of_start, *shared))(x), mesh)
 
     def iterate(parameters: Any, state: Any, key: Array, memory: Array) -> tuple[Any, Any, Array]:
@@ -267,7 +267,7 @@ def _iteration(
 
 
 def _robust(off: Array) -> Array:
-    """Returns a loss, quadratic for small errors and linear for large ones, because slopes jump at a ridge of V."""
+    """Returns a loss that is quadratic for small and linear for large errors, because slopes jump at a ridge of V."""
     size = 0.1
     return size**2 * (jnp.sqrt(1 + (off / size) ** 2) - 1)
 

@@ -1,18 +1,18 @@
-"""Value of a control problem of two states on a grid: an independent reference for other solutions.
+"""Value of a two-state control problem on a grid: an independent reference for other solutions.
 
     V(x) = min over u of  integral from 0 to dt of e^(-rho t) (q + g) dt + e^(-rho dt) V(x(dt))
 
 The scheme is semi-Lagrangian (Falcone and Ferretti 2014): the classical Runge-Kutta method with held controls gives the
-feet x(dt) of characteristics, and linear interpolation gives V there. This makes the scheme monotone and its fixed
-point unique: it converges to the viscosity solution, and Howard's policy iteration (1960), which never raises V,
-converges to the fixed point. (With cubic interpolation it did not at ridges.) The candidates for a control are the
-present one, a list over the range, and the controls u = grad g*(-Bᵀ V_x) for the slopes of V on both sides, by the
-conjugate of their cost. Coarse grids initialise fine ones. The result is read by cubics, which do not overshoot at
-ridges, because they are limited to the values of the four surrounding corners (Bermejo and Staniforth 1992).
+feet x(dt) of characteristics, and linear interpolation gives V there. The scheme is then monotone with a unique fixed
+point: it converges to the viscosity solution, and Howard's policy iteration (1960), which never raises V, converges to
+the fixed point. (With cubic interpolation it did not at ridges.) The candidates for a control are the present control,
+a list over the range, and u = grad g*(-Bᵀ V_x) for the slopes of V on both sides. Coarse grids initialise fine ones.
+Cubic interpolation reads the result; limited to the values of the four surrounding corners, it does not overshoot at
+ridges (Bermejo and Staniforth 1992).
 
-Linear interpolation has an error of O(h²/dt) and held controls of O(dt²), so dt should be as long as the controls
-allow. The change between two grids estimates the distance of V from its limit; `extrapolated` removes most of it where
-V is smooth. `lookahead` gives the policy of V; the cost of following it bounds the true value from above.
+Linear interpolation causes an error of O(h²/dt) and held controls an error of O(dt²), so dt should be as long as the
+controls allow. The change between two grids estimates the distance of V from its limit; `extrapolated` removes most of
+it where V is smooth. `lookahead` gives the policy of V. The cost of this policy bounds the true value from above.
 """
 
 import math
@@ -45,7 +45,7 @@ class Grid(NamedTuple):
     """Distance between neighbouring nodes along each side."""
     shape: tuple[int, ...]
     circle: tuple[bool, ...]
-    """Whether a side is a circle: its last node is its first and is not stored."""
+    """True for a side that is a circle: its last node equals the first and is not stored."""
 
     @property
     def nodes(self) -> Float[np.ndarray, "A B 2"]:
@@ -68,7 +68,7 @@ class GridValue(NamedTuple):
 
     @property
     def converged(self) -> Bool[Array, ""]:
-        """Whether `change` is within the tolerance; `solvers.ending.reason(ending)` says why not."""
+        """True if `change` is within the tolerance; otherwise `solvers.ending.reason(ending)` gives the reason."""
         return self.ending == Ending.CONVERGED
 
 
@@ -84,19 +84,19 @@ def solve_on_grid(
     improvements: int = 100,
     start: GridValue | None = None,
 ) -> GridValue:
-    """Solves for the value on several grids, the coarsest first, and returns it on the last.
+    """Solves for the value on several grids, the coarsest first, and returns the value on the last grid.
 
     Args:
         problem: a problem with two states and one control.
         points: number of nodes per side, for every grid; on a circle the last node is the first.
-        low: lower corner of the rectangle [2]. Trajectories that would leave it stay on its edge: make it large enough
-            for those of interest.
+        low: lower corner of the rectangle [2]. Trajectories cannot leave it and stay on its edge, so make it large
+            enough.
         high: upper corner.
         limit: largest magnitude of the control; the cost must be finite there.
-        dt: time in s for which controls are held, with an error of O(dt²); that of interpolation is O(h²/dt) for nodes
-            at a distance h.
+        dt: holding time of controls, s, with an error of O(dt²); interpolation has an error of O(h²/dt) for nodes at
+            distance h.
         tolerance: largest change of V, relative to the largest V.
-        improvements: largest number of policy improvements per grid; the result states whether they sufficed.
+        improvements: largest number of policy improvements per grid; `GridValue.converged` tells whether they sufficed.
         start: a solution on a coarser grid.
 
     Raises:
@@ -106,7 +106,7 @@ def solve_on_grid(
     if low.shape != (2,) or high.shape != (2,) or not (low < high).all():
         raise InputError(f"the rectangle is {low} to {high}; expected two ascending numbers each, for two states")
     if not len(points) or min(points) < 5:
-        raise InputError(f"points are {tuple(points)}; expected a number for each grid, 5 or more")
+        raise InputError(f"points are {tuple(points)}; expected a number of at least 5 for each grid")
     require_positive(limit=limit, dt=dt, tolerance=tolerance, improvements=improvements)
     circle = tuple(circles(problem).tolist())
     step, discount = flow(problem, dt), math.exp(-problem.discount * dt)
@@ -136,7 +136,7 @@ def extrapolated(coarse: GridValue, fine: GridValue, x: Any) -> Array:
 def lookahead(problem: ControlProblem, value: GridValue, *, limit: float, dt: float = 0.05) -> Law:
     """Returns the policy of a value on a grid: x [2] -> the listed control u [1] with the lowest cost over dt plus V.
 
-    The cost of following it is at least the true value, so it bounds V from above.
+    The cost of this policy is an upper bound of the true value.
     """
     step, listed = flow(problem, dt), jnp.linspace(-limit, limit, 8 * CONTROLS + 1)
 
@@ -177,7 +177,7 @@ def _iterate(
         return [jnp.clip(jax.vmap(jax.vmap(policy))(nodes, jnp.stack(pair, axis=-1)), -limit, limit) for pair in pairs]
 
     def improved(V: Array, u: Array) -> tuple[Array, Array]:
-        """Returns the best control at every node and its V; the present control stays unless another is better."""
+        """Returns the best control and its V at every node; the present control stays unless another is better."""
 
         def better(best: tuple[Array, Array], other: Array) -> tuple[tuple[Array, Array], None]:
             of_other = total(V, other)
@@ -224,7 +224,7 @@ def _iterate(
 def linear(grid: Grid, x: Array) -> tuple[Array, ...]:
     """Returns the stencil of bilinear interpolation at states x [..., 2]; beyond an edge, the edge's value applies.
 
-    It holds rows and columns of nodes [k, ...], and weights of both, which are not negative and sum to one.
+    It holds rows and columns of nodes [k, ...] with non-negative weights that sum to one.
     """
     return _stencil(grid, x, (0, 1))
 
@@ -248,7 +248,7 @@ def interpolated(grid: Grid, values: Array, x: Any) -> Array:
 
 
 def one_sided_slopes(grid: Grid, values: Array, axis: int) -> tuple[Array, Array]:
-    """Returns backward and forward difference quotients along an axis; at an edge both are the one that exists."""
+    """Returns backward and forward difference quotients along an axis; at an edge both are the one-sided quotient."""
     forward = (jnp.roll(values, -1, axis) - values) / grid.steps[axis]
     backward = jnp.roll(forward, 1, axis)
     if grid.circle[axis]:

@@ -1,15 +1,15 @@
 """Optimal control problem of any plant, with costs, box, discount and times from its natural scales.
 
-The plant falls from its goal at the rate f, and motors at their limits accelerate a coordinate by a:
+The plant falls from its goal at the rate f, and a motor at its limit accelerates its coordinate by a:
 
     lambda = max(f, √(a / π))  1/s,    sizes r: π for a joint that turns freely, half the range of a limited one, else
                                        3 max(a, g) / lambda²
 
     q(x) = sum w π² sin²((θ - θ0)/2)  or  w (x - x0)²,  and v qd²,  + barriers of limited coordinates
     w = 1 for angles (1/2 with a motor), 5 / r² for slides,   v = 1 / lambda² and 2 / (lambda r)²
-    g(u) is that of limited controls: half of all limits together cost effort π², if hanging costs π²
+    g(u): cost of limited controls; half of all limits together cost effort π², if hanging costs π²
 
-The box contains the whole circle or range, and rates up to 2.4 lambda, or for slides up to what the motor reaches.
+The box contains the whole circle or range, and rates up to 2.4 lambda, or for slides up to the reach of the motor.
 Times of the fit and of the discount are multiples of 1 / lambda.
 """
 
@@ -35,11 +35,11 @@ from dln_jax.nn.activations import softplus
 from dln_jax.types import InputError, JointKind, Scalar
 
 EFFORT = 0.25
-"""Cost of half of all limits, relative to that of hanging."""
+"""Cost of half of all limits, relative to the cost of hanging."""
 SHARE, HORIZON = 0.8, 40.0
 """Weight of a cost after the horizon, and the horizon in units of 1 / lambda."""
 FASTEST = 2.4
-"""Rates of the box, in units of lambda times the size of a joint."""
+"""Largest rates in the box, in units of lambda times the size of a joint."""
 WALL, STEEPNESS = 0.8, 10.0
 """Start of a barrier, as a share of half the range, and its steepness in units of half the range."""
 NEAR = 0.2
@@ -47,14 +47,14 @@ NEAR = 0.2
 SLOWEST = 1e-6
 """Smallest lambda of a plant that moves, 1/s."""
 MARGIN = 1e-3
-"""Margin of the action cost's range beyond the limits."""
+"""Margin of the action cost beyond the limits."""
 FOLDER = Path(__file__).parent / "mjcf"
 """MJCF files of desktop plants."""
 
 
 @dataclass(frozen=True)
 class OwnProblem:
-    """All numbers of a problem, as JSON values that rebuild it even if defaults change."""
+    """All numbers of a problem as JSON values, independent of later defaults."""
 
     names: tuple[str, ...]
     joints: tuple[JointKind, ...]
@@ -79,7 +79,7 @@ class OwnProblem:
 
     @property
     def turning(self) -> tuple[bool, ...]:
-        """Whether each coordinate turns freely, so that its states are a circle."""
+        """Mask of the coordinates that turn freely, on a circle."""
         return tuple(
             kind == "revolute" and low is None and high is None
             for kind, (low, high) in zip(self.joints, self.positions, strict=True)
@@ -99,7 +99,7 @@ def own_problem(
     weights: Any = None,
     box: Any = None,
 ) -> OwnProblem:
-    """Chooses the numbers of a problem by the scales of a plant.
+    """Chooses the numbers of a problem from the scales of a plant.
 
     Args:
         model: smooth model of the plant.
@@ -109,8 +109,8 @@ def own_problem(
         box: half widths [2 d].
 
     Raises:
-        InputError: the limits cannot hold the goal or it is not an equilibrium, numbers have the wrong count or sign,
-            or the plant neither falls nor is driven.
+        InputError: the limits cannot hold the goal, the goal is not an equilibrium, numbers have the wrong count or
+            sign, or the plant neither falls nor has a motor.
     """
     B, size = layout.actuation, layout.limits.control[:, 1]
     passive = np.flatnonzero((B == 0).all(axis=1))
@@ -119,7 +119,7 @@ def own_problem(
         goal = np.asarray(nearest_equilibrium(model, goal, passive.tolist()))
     held = np.abs(np.asarray(holding_controls(model, goal, B))) if isinstance(model, Dynamics) else np.zeros(len(size))
     if not (held < size).all():
-        raise InputError(f"the goal takes controls of {held.tolist()}; the limits are {size.tolist()}: widen them")
+        raise InputError(f"the goal takes controls of {held.tolist()}; the limits are {size.tolist()}; widen them")
     fall, acceleration = _rates(model, goal, B, size)
     scale = max(fall, math.sqrt(float(np.max(acceleration)) / math.pi))
     if not SLOWEST < scale < np.inf:
@@ -161,7 +161,7 @@ def own_problem(
 def _rates(
     model: Dynamics | InverseForward, goal: np.ndarray, B: np.ndarray, size: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Returns the rate of the fall from the goal, 1/s, and accelerations [d] by each joint's own motor at its limit."""
+    """Returns the rate of falling from the goal, 1/s, and the accelerations [d] by each joint's motor at its limit."""
     field, d, still = field_of(model), len(goal), jnp.zeros(len(goal))
 
     def accelerations(q: Array, tau: Array) -> Array:
@@ -176,13 +176,13 @@ def _rates(
 
 
 def _stated(name: str, usual: np.ndarray, wish: Any) -> tuple[float, ...]:
-    """Returns positive numbers [2 d], by default the usual ones."""
+    """Returns positive numbers [2 d]; default: `usual`."""
     if wish is None:
         return tuple(usual.tolist())
     numbers = np.asarray(wish, float)
     if numbers.shape != usual.shape or not (np.isfinite(numbers) & (numbers > 0)).all():
         raise InputError(
-            f"{name} are {numbers.tolist()}; expected {len(usual)} positive numbers, for coordinates and then rates"
+            f"{name} are {numbers.tolist()}; expected {len(usual)} positive numbers, coordinates first, then rates"
         )
     return tuple(numbers.tolist())
 
@@ -215,7 +215,7 @@ def own_plant(model: Dynamics | InverseForward, numbers: OwnProblem) -> ControlP
     bounded = np.isfinite(ranges).all(axis=1)
     middle = goal.copy()
     middle[:d][bounded] = ranges[bounded].mean(axis=1)
-    # Limited joints move along a line, so a value needs no circle for them.
+    # Limited joints move along a line, not on a circle.
     kinds: tuple[JointKind, ...] = tuple("revolute" if turns else "prismatic" for turns in turning)
     drift, actuation = from_plant(model, np.asarray(numbers.actuation))
     limit, tau = np.asarray(numbers.limits), 2 * (1 + MARGIN) / np.pi
@@ -257,7 +257,7 @@ def _state_cost(
 
 
 def own_settings(numbers: OwnProblem) -> tuple[Iteration, float]:
-    """Returns the settings of the iteration, with times in units of 1 / lambda, and the factor on V of its network."""
+    """Returns the settings of the iteration, with times in units of 1 / lambda, and the network's factor on V."""
     unit = 1 / numbers.scale
     return Iteration(
         iterations=80, starts=2048, kept=6, steps=250, slope_weight=0.1, floor=0.01, followed=4.0,
@@ -266,7 +266,7 @@ def own_settings(numbers: OwnProblem) -> tuple[Iteration, float]:
 
 
 def described(numbers: OwnProblem) -> list[str]:
-    """Returns lines that describe the numbers of a problem."""
+    """Returns lines of text with the numbers of a problem."""
 
     def listed(values: Sequence[float], units: Mapping[str, str]) -> str:
         pairs = zip(numbers.names, numbers.joints, values, strict=True)

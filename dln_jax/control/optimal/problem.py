@@ -2,12 +2,12 @@
 
     V(x) = min_u  integral_0^inf e^(-rho t) [q(x) + g(u)] dt,    dx/dt = a(x) + B(x) u
 
-For convex g the optimal control has a closed form, which removes the minimum (Lutter, Belousov et al. 2019):
+For convex g a closed form of the optimal control removes the minimum (Lutter, Belousov et al. 2019):
 
     u = grad g*(-Bᵀ V_x),    rho V + g*(-Bᵀ V_x) - q - aᵀ V_x = 0
 
-V is a cost, non-negative and minimised. Formulations with rewards, such as continuous fitted value iteration
-(arXiv:2105.04682), have the reward -q - g, the value -V and u = grad g*(+Bᵀ dvalue/dx).
+V is a cost: non-negative, and minimised. In formulations with rewards, such as continuous fitted value iteration
+(arXiv:2105.04682), the reward is -q - g, the value -V and u = grad g*(+Bᵀ dvalue/dx).
 """
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from dln_jax.mechanics.integrators import rk4
 from dln_jax.types import InputError, JointKind, Scalar, require_positive
 
 Flow = Callable[..., tuple[Array, Scalar]]
-"""(x [n], u [m], change of dx/dt [n], none by default) -> the state after a step [n], and its discounted cost."""
+"""(x [n], u [m], change of dx/dt [n]; default: none) -> state after a step [n], and the discounted cost of the step."""
 Disturbance = Callable[[Array, Array, Array], Array]
 """(x, V_x, u) -> the change of dx/dt [n] due to the worst disturbance."""
 ValueAndGradient = Callable[[Array], tuple[Scalar, Array]]
@@ -61,7 +61,7 @@ Affine = tuple[Callable[[Array], Array], Callable[[Array], Array]]
 
 
 def from_plant(plant: Dynamics | InverseForward, actuation: Any = None) -> Affine:
-    """Returns a and B of a mechanical system, on x = (q, qd), whose accelerations are affine in the forces.
+    """Returns a and B of a mechanical system on x = (q, qd), with accelerations affine in the forces.
 
     Args:
         plant: for example from `mechanics.equations.dynamics`.
@@ -106,7 +106,7 @@ def checked(problem: ControlProblem, *, tolerance: float = 1e-6) -> ControlProbl
 
     Args:
         problem: problem to validate.
-        tolerance: largest |dx/dt| at the goal with the cheapest control, and largest cost there.
+        tolerance: largest |dx/dt| and largest cost at the goal with the cheapest control.
 
     Raises:
         InputError: shapes do not agree, the box is empty, the discount is negative, or the goal is outside the box, is
@@ -124,7 +124,7 @@ def checked(problem: ControlProblem, *, tolerance: float = 1e-6) -> ControlProbl
     if not problem.discount >= 0:
         raise InputError(f"discount is {problem.discount}; expected a rate in 1/s, 0 or more")
 
-    @jax.jit  # as one program, because many small ones take longer to compile
+    @jax.jit  # one program compiles faster than many small ones
     def at_rest(x: Array) -> tuple[Array, Array]:
         u = optimal_control(problem, x, jnp.zeros_like(x))
         return jnp.max(jnp.abs(rates(problem)(x, u))), problem.state_cost(x) + problem.action_cost.cost(u)
@@ -133,10 +133,10 @@ def checked(problem: ControlProblem, *, tolerance: float = 1e-6) -> ControlProbl
     if not moving <= tolerance:
         raise InputError(
             f"the goal is not an equilibrium: dx/dt is {moving:.3g} there with the cheapest control, above "
-            f"{tolerance:g}; give a state at rest, or centre the action cost at the control that holds it"
+            f"{tolerance:g}; give a state at rest, or centre the action cost at the holding control"
         )
     if not abs(cost) <= tolerance:
-        raise InputError(f"a second at the goal costs {cost:.3g}; expected none, as V is zero there")
+        raise InputError(f"the goal costs {cost:.3g} per second; expected zero, because V is zero there")
     return problem._replace(low=low, high=high, goal=goal)
 
 
@@ -164,9 +164,9 @@ def flow(problem: ControlProblem, dt: float, *, clipped: bool = False) -> Flow:
 
     Args:
         problem: defines plant and costs.
-        dt: time for which the controls are held, s.
-        clipped: whether states that are not on a circle are clipped to the box, as in published fitted iterations; this
-            changes the plant wherever trajectories leave the box.
+        dt: holding time of the controls, s.
+        clipped: clip states that are not on a circle to the box, as in published fitted iterations. This changes the
+            plant where trajectories leave the box.
     """
     require_positive(dt=dt)
     field, rho = rates(problem), problem.discount
@@ -197,7 +197,7 @@ def drawn(problem: ControlProblem, key: Array, count: int) -> Float[Array, "N n"
     """Returns random states: half of them uniform in the box, half in boxes shrunk by a uniformly distributed factor.
 
     Angles on a circle are uniform in both. In a box of several dimensions nearly all uniform states are far from rest,
-    where motions rarely are.
+    but motions rarely are.
     """
     of_box, of_share = jax.random.split(key)
     goal = jnp.asarray(problem.goal, float)
@@ -223,7 +223,7 @@ def hjb_policy(value_and_gradient: ValueAndGradient, problem: ControlProblem) ->
         value_and_gradient: x -> V and V_x, for example of a trained network.
         problem: with B and g.
     """
-    # A limited control is finite even if a rate is infinite.
+    # A limited control would be finite even at an infinite rate.
     return lambda x: where_finite(optimal_control(problem, x, value_and_gradient(x)[1]), x)
 
 
@@ -242,7 +242,7 @@ def worst_disturbance(
 
         dx/dt = f(x + xi_o, u + xi_u, p + xi_p) + xi_x
 
-    Every disturbance increases the cost to go as fast as its bound permits, to first order in V_xᵀ f:
+    To first order in V_xᵀ f, every disturbance increases the cost to go as fast as its bound allows:
 
         xi_x along V_x,   xi_u along Bᵀ V_x,   xi_o along (df/dx)ᵀ V_x,   all of prescribed length,
         xi_p = +- a share of every parameter, by the sign of (df/dp)ᵀ V_x
@@ -252,7 +252,7 @@ def worst_disturbance(
     Args:
         plant: (x [n], u [m], p [k]) -> dx/dt [n], f.
         p: parameters [k].
-        state: bound of |xi_x|, in the units of dx/dt; zero for none, as for the others.
+        state: bound of |xi_x|, in the units of dx/dt; here and below, zero for no disturbance.
         action: bound of |xi_u|, in the units of u.
         observation: bound of |xi_o|, in the units of x.
         parameters: bound of |xi_p| / |p|.

@@ -1,20 +1,20 @@
-"""Networks for the cost to go that are zero at the goal and positive elsewhere, with gradients in the same pass.
+"""Networks for the cost to go: zero at the goal, positive elsewhere, with gradients in the same pass.
 
     V(x) = (z - z0)ᵀ L(z) L(z)ᵀ (z - z0)
 
-L is lower triangular with a positive diagonal; its entries are the outputs of a differential network of z - z0
-(Lutter et al. 2021, arXiv:2105.04682). z holds the sines and cosines of angles and the other states in units of the
-box. Without hidden layers L is constant and V a quadratic form, which solves a linear-quadratic problem exactly.
-The parameters have a leading axis of ensemble members; V and V_x are the means over it. The module `fitted`
-fits them by rollouts.
+L is lower triangular with a positive diagonal; its entries are the outputs of a differential network of z - z0 (Lutter
+et al. 2021, arXiv:2105.04682). z holds the sines and cosines of angles and the other states in units of the box.
+Without hidden layers L is constant and V a quadratic form, which solves a linear-quadratic problem exactly. The
+parameters have a leading axis of ensemble members; V and V_x are means over the members. The module `fitted` fits the
+parameters by rollouts.
 
-`fit_hjb` fits them to the Hamilton-Jacobi-Bellman equation, by Levenberg-Marquardt in float64. It minimises the mean
-square over the box of
+`fit_hjb` fits the parameters to the Hamilton-Jacobi-Bellman equation by Levenberg-Marquardt in float64. It minimises
+the mean square over the box of
 
     (rho V + g*(-Bᵀ V_x) - q - aᵀ V_x) / (mean of q)
 
-The equation has several solutions, and only one is the cost to go. With a large discount that one is near q / rho
-and the others are far away. Training starts there and follows it while the discount decreases to the problem's own
+The equation has several solutions, and only one is the cost to go. With a large discount this solution is near q / rho,
+far from the others. Training starts there and follows the solution while the discount decreases to the problem's value
 (continuation: Lutter, Belousov et al. 2019). Every fit draws new samples; unseen samples select the parameters.
 """
 
@@ -70,7 +70,7 @@ class ValueProgress(NamedTuple):
     seconds: float
     """Time since the start."""
     discount: float
-    """Discount of the equation that is fitted, 1/s."""
+    """Discount of the fitted equation, 1/s."""
 
 
 class ValueFit(NamedTuple):
@@ -82,7 +82,7 @@ class ValueFit(NamedTuple):
     history: list[ValueProgress]
     train_seconds: float
     compile_seconds: float = 0.0
-    """Time of compilation that is not counted in `train_seconds`."""
+    """Compilation time, not included in `train_seconds`."""
 
 
 def value_network(
@@ -146,7 +146,7 @@ def value_network(
 
 
 def discounts_down_to(discount: float, *, first: float = 30.0, ratio: float = 0.5, last: float = 0.01) -> list[float]:
-    """Returns discount + first ratioᵏ while the second term is at least `last`, then the discount itself, all in 1/s.
+    """Returns discount + first ratioᵏ while the second term is at least `last`, then the discount, all in 1/s.
 
     Args:
         discount: rho of the problem.
@@ -159,7 +159,7 @@ def discounts_down_to(discount: float, *, first: float = 30.0, ratio: float = 0.
     """
     require_positive(first=first, ratio=ratio, last=last)
     if not ratio < 1:
-        raise InputError(f"ratio is {ratio}; expected less than 1, so that the discount decreases")
+        raise InputError(f"ratio is {ratio}; expected less than 1 for a decreasing discount")
     steps = max(int(np.floor(np.log(last / first) / np.log(ratio))), 0) + 1
     return [*(discount + first * ratio**step for step in range(steps)), discount]
 
@@ -187,7 +187,7 @@ def fit_hjb(
         value_and_gradient: (parameters, x) -> V and V_x, for example of `value_network`.
         parameters: initial parameters, float64.
         key: random key of the samples.
-        discounts: decreasing to the problem's own; by default `discounts_down_to` it.
+        discounts: decreasing to the problem's discount; by default from `discounts_down_to`.
         samples: number of samples per draw, uniform in the box.
         validation: number of samples that select the parameters.
         iterations: largest number of Levenberg-Marquardt iterations per draw of samples.
@@ -195,8 +195,8 @@ def fit_hjb(
         patience: the fit ends after this many rounds without a lower validation.
         disturbance: worst-case disturbance, for a robust value function.
         mesh: devices that share the samples of a fit.
-        report: called after every draw, with residuals that are root mean squares relative to the mean of q: `loss` on
-            the samples of the fit, `validation` on others, with this discount.
+        report: called after every draw with the root mean square residuals relative to the mean of q: `loss` on the
+            fitted samples and `validation` on unseen samples, at this discount.
 
     Raises:
         InputError: the problem is invalid, the discounts do not end with its own, or the equation is not finite.
@@ -235,7 +235,7 @@ def fit_hjb(
         x = uniform(problem, jax.random.fold_in(of_draws, len(history)), samples)
         with held_back():  # as in `fitted.fit_values`
             parameters, loss = advance(parameters, x, jnp.asarray(discount))
-            # This number decides how many rounds there are, so all processes must use the same value.
+            # This number decides the number of rounds, so all processes must use the same value.
             left = of_first_process(float(validated(parameters, jnp.asarray(discount))), mesh)
             passed = time.perf_counter() - began
             history.append(ValueProgress(len(history) + 1, float(loss), float(left), passed, discount))
@@ -253,6 +253,6 @@ def fit_hjb(
             break
     if not np.isfinite(lowest):
         raise InputError(
-            "the equation is not finite at the samples; look for states in the box where the plant or a cost is not"
+            "the equation is not finite at the samples; find states where the plant or a cost is not finite"
         )
     return ValueFit(local(best, mesh), float(lowest), history, history[-1].seconds)

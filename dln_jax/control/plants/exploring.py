@@ -1,11 +1,11 @@
-"""Motions from which any plant can be learned without a model: first smooth noise, then energy laws of a learned model.
+"""Motions for learning any plant without a model: first smooth noise, then energy laws of a learned model.
 
-1. Blind episodes: smooth noise, with a spring and a damper that are scaled by the limits of motors and coordinates. An
-   episode that `guarded` stops halves the noise of all later ones, and the rest of its time is tried once more.
-2. A model is fitted. The other episodes follow its energy law, with noise, some to energies below that of the goal and
-   some above; the model is fitted again on the way.
-3. If none of these came near the goal, as with an acrobot, whose motor hardly reaches its passive joint, the model does
-   not know the weight there. The remaining episodes follow a plan of the model to the goal, with less noise.
+1. Blind episodes: smooth noise, with a spring and a damper scaled by the limits of motors and coordinates. If `guarded`
+   stops an episode, later episodes have half the noise, and the rest of its time is repeated once.
+2. A model is fitted. The other episodes follow its energy law, with noise, to energies below and above the goal; the
+   model is refitted on the way.
+3. If no episode came near the goal, the model does not know the weight there. This happens with an acrobot, because its
+   motor hardly moves the passive joint. The remaining episodes follow a plan of the model to the goal, with less noise.
 """
 
 from collections import deque
@@ -37,7 +37,7 @@ FITTED_EVERY = 2
 NEAR = 0.5
 """Largest distance of every angle from the goal that counts as near, rad."""
 SHORTEST = 1.0
-"""Shortest episode that is kept, s."""
+"""Shortest useful episode, s."""
 
 
 class Exploration(NamedTuple):
@@ -48,16 +48,16 @@ class Exploration(NamedTuple):
     blind: tuple[float, ...] = (0.3, 0.6)
     """Standard deviations of the noise of the blind episodes, as shares of the limits."""
     surplus: tuple[float, ...] = (-0.5, 0.2, 0.6, 1.0)
-    """Energies to which the other episodes drive the passive joints, above that of the goal, as shares of the energy
-    from hanging to the goal."""
+    """Target energies of the passive joints in the other episodes, relative to the goal, as shares of the energy from
+    hanging to the goal."""
     noise: float = 0.3
     """Standard deviation of their noise, as a share of the limits."""
     along_plans: float = 0.1
-    """The same for episodes that follow plans, whose feedback has less to spare."""
+    """The same for episodes that follow plans; their feedback has less margin."""
     bandwidth: float = 3.0
     """Bandwidth of the noise, Hz."""
     share: float = 0.8
-    """Largest share of the motors' limits that is used."""
+    """Largest used share of the motors' limits."""
 
 
 class Explored(NamedTuple):
@@ -85,7 +85,8 @@ def explore(
         seed: seed of the noise.
 
     Raises:
-        InputError: a setting is out of range, a start is outside the limits, or fewer than two episodes were kept.
+        InputError: a setting is out of range, a start is outside the limits, or fewer than two episodes were long
+            enough.
     """
     require_seed(seed)
     require_positive(seconds=exploration.seconds, bandwidth=exploration.bandwidth, share=exploration.share)
@@ -157,12 +158,13 @@ def recording_of(runs: list[PlantRun], layout: Layout) -> Trajectories:
 
 
 def _start(layout: Layout, number: float | int) -> Any:
-    """Returns the memory of `by_differences` before the first sample, for a controller whose memory is a number."""
+    """Returns the memory of `by_differences` before the first sample, for a controller with a number as memory."""
     return by_differences(layout)(Controller(jnp.asarray(number), lambda memory, t, x: (memory, x))).start
 
 
 def _with_noise(states: Controller, layout: Layout) -> Any:
-    """Compiles a controller of states for measurements, with noise: its memory is (that of `_start`, noise [N, m])."""
+    """Compiles a controller of states for measurements, with noise; its memory is (memory from `_start`, noise [N,
+    m])."""
     controller = by_differences(layout)(states)
 
     def act(memory: Any, t: Array, y: Array) -> tuple[Any, Array]:
@@ -202,7 +204,7 @@ def _fitted_law(
     layout: Layout, fit: Callable[[Trajectories], Dynamics], runs: list[PlantRun], before: _Law, *, may_plan: bool,
     seed: int,
 ) -> _Law:  # fmt: skip
-    """Returns the law of a model of the runs so far, or the one before if there is no model or plan."""
+    """Returns the law of a model of the runs so far, or the previous law if there is no model or plan."""
     if len(runs) < 2:
         return before
     try:
@@ -228,7 +230,7 @@ def _energy_law(upright: Upright) -> Any:
     def law(surplus: Array, t: Array, x: Array) -> tuple[Array, Array]:
         wanted = surplus * upright.scales.energy
         shaped = energy_shaping(upright.model, upright.parts, home, gains, surplus=wanted)
-        # Beyond half of the reach the spring pushes back, whatever the model says.
+        # Beyond half of the reach the spring pushes back, independent of the model.
         pull = spring(x)
         u = jnp.clip(upright.controls(shaped(*jnp.split(x, 2))), *layout.limits.control.T)
         return surplus, u - 2 * size * (pull - jnp.clip(pull, -1.0, 1.0))

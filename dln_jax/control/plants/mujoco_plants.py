@@ -44,34 +44,34 @@ def mujoco_plant(
 ) -> Plant:
     """Returns a simulated plant; a learner knows only its layout.
 
-    Controls are forces of the joints. They act through the motors of the file and within their limits; a joint without
-    an actuator gets them directly. The plant may have friction, drag, contacts and limits of joints. Refused are other
-    actuators than motors, closed loops, springs, gravity compensation, wind and plugins.
+    Controls are joint forces. They act through the motors of the file, within their limits, or directly on joints
+    without an actuator. The plant may have friction, drag, contacts and joint limits. Actuators other than motors,
+    closed loops, springs, gravity compensation, wind and plugins are refused.
 
     Args:
         source: path of an MJCF or URDF file, text of MJCF, or a `mujoco.MjModel`.
         actuated: joints with a motor, by name or number from 0; by default those with an actuator, or in a URDF with a
             transmission.
-        control: largest forces of the motors, N m or N; by default those of the file, and not above them.
-        goal: posture to hold [d]; by default the highest one, with slides in the middle of their ranges.
-        hanging: posture of rest [d]; by default the lowest one.
+        control: largest forces of the motors, N m or N; by default the limits of the file, which they must not exceed.
+        goal: posture to hold [d]; by default the highest posture, with slides in the middle of their ranges.
+        hanging: posture at rest [d]; by default the lowest posture.
         rate: sampling rate, Hz; by default one sample per time step.
-        speed: largest rates, one or [d]; by default those of a URDF, as MJCF cannot state them.
-        passive: whether a joint without a motor is required, as for a swing-up.
+        speed: largest rates, one or [d]; by default the URDF's limits (MJCF has none).
+        passive: require a joint without a motor, as for a swing-up.
         hardware: noise, resolution and delay.
         seed: seed of the starts and the noise.
 
     Raises:
         InputError: MuJoCo is missing or refuses the model; a joint is not a hinge or slide, or not in the file; the
-            file has what is refused, or numbers that are not finite; a motor has no limits; there is no motor or no
-            passive joint, or gravity does not move a passive joint; bodies touch at the goal or hanging; a sample is
-            not a whole number of steps.
+            file has an element that is refused above, or non-finite numbers; a motor has no limits; there is no motor
+            or no passive joint, or gravity does not move a passive joint; bodies touch at the goal or hanging; a sample
+            is not a whole number of steps.
     """
     mujoco, model, speeds, transmissions = _model(source)
     names = joint_names(model)
     for name, kind in zip(names, model.jnt_type, strict=True):
         if kind in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)):
-            raise InputError(f"joint '{name}' is neither a hinge nor a slide; expected a plant with such joints only")
+            raise InputError(f"joint '{name}' is neither a hinge nor a slide; expected only hinges and slides")
     if not 1 + passive <= len(names) <= MOST_JOINTS:
         which = f"2 to {MOST_JOINTS}, one of them passive" if passive else f"1 to {MOST_JOINTS}"
         raise InputError(f"the plant has {len(names)} joint(s); expected {which}")
@@ -104,14 +104,14 @@ def mujoco_plant(
             for k in sorted(set(range(len(joints))) - set(driven)) if passive else ():
                 if hanging[k] in ranges[k]:
                     raise InputError(
-                        f"'{names[k]}' cannot hang within its range of {ranges[k, 0]:.4g} to {ranges[k, 1]:.4g}, where "
-                        "a swing-up starts; widen the range, or remove it"
+                        f"'{names[k]}' cannot hang within its range of {ranges[k, 0]:.4g} to {ranges[k, 1]:.4g}, and "
+                        "a swing-up starts there; widen or remove the range"
                     )
     if control is None and not (passive and len(driven) == len(joints)):  # the layout refuses these
         for k in driven:
             if not 0 < largest[k] < np.inf:
                 raise InputError(
-                    f"the file states no limit of the motor of joint '{names[k]}'; give the largest force (--control), "
+                    f"the file has no limit for the motor of joint '{names[k]}'; give the largest force (--control), "
                     "or an actuatorfrcrange"
                 )
         control = largest[driven]
@@ -160,10 +160,10 @@ def simulate_in_mujoco(
     hardware: Hardware = Hardware(),  # noqa: B008
     key: Array | None = None,
 ) -> ClosedLoopRun:
-    """Runs `simulate` with MuJoCo's integrator and time step, which share no equations with this library.
+    """Runs `simulate` with MuJoCo, which is independent of the equations in this library.
 
-    After a control that is not finite, or if MuJoCo warns of divergence, everything is NaN. The plant is any model with
-    hinges and slides; not differentiable.
+    After a non-finite control, or if MuJoCo warns of divergence, everything is NaN. The plant is any model of hinges
+    and slides. The simulation is not differentiable.
 
     Args:
         model: the text of an MJCF file, for example of a tree from `data.robot_files.mjcf`, or a `mujoco.MjModel`.
@@ -173,7 +173,7 @@ def simulate_in_mujoco(
         rate: sampling rate, Hz; a sample is a whole number of MuJoCo's time steps.
         actuation: matrix [actuators, m] in ctrl = actuation u; by default u is ctrl.
         hardware: limits, noise, delay; the model's own limits also apply.
-        key: random key of the noise; required if there is any.
+        key: random key of the noise; required with noise.
 
     Raises:
         InputError: MuJoCo is missing or refuses the model; a joint is neither a hinge nor a slide; x has another size;
@@ -191,11 +191,11 @@ def simulate_in_mujoco(
 
     def advanced(x: Any, u: Any) -> np.ndarray:
         x, control = np.asarray(x), B @ np.asarray(u)
-        # MuJoCo continues its own state, which is more than x, such as the start of its solver; another x begins anew.
+        # MuJoCo continues from its own state, which also holds the start of its solver. Another x begins anew.
         if not np.array_equal(x, last[0]):
             mujoco.mj_resetData(model, data)
             data.qpos[:], data.qvel[:] = np.split(x, 2)
-        # MuJoCo replaces values that are not finite, and resets when it diverges: both would hide a failure.
+        # MuJoCo replaces non-finite values, and resets after divergence: both would hide a failure.
         finite = np.isfinite(control).all() and np.isfinite(x).all()
         if finite:
             data.ctrl[:] = control
@@ -229,7 +229,7 @@ def _sampling(model: Any, rate: float | None = None) -> tuple[float, int]:
     """
     step = float(model.opt.timestep)
     if not 0 < step < np.inf:
-        raise InputError(f"the time step of the model is {step:g} s; expected a positive, finite one")
+        raise InputError(f"the time step of the model is {step:g} s; expected a positive, finite number")
     rate = float(1 / step if rate is None else rate)
     steps = 1 / rate / step
     if not 0.5 < steps < np.inf or abs(steps - round(steps)) > 1e-6:
@@ -238,7 +238,7 @@ def _sampling(model: Any, rate: float | None = None) -> tuple[float, int]:
 
 
 def _require_known_forces(mujoco: Any, model: Any) -> None:
-    """Raises `InputError` for forces that neither motors nor the potential of a chain explain, or disabled motors."""
+    """Raises `InputError` for forces other than motors and the gravity of a chain, and for disabled motors."""
     off = model.opt.disableactuator or model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
     for what, present in {
         "disabled actuators": off and model.nu,
@@ -247,17 +247,17 @@ def _require_known_forces(mujoco: Any, model: Any) -> None:
         "plugins": model.nplugin,
     }.items():
         if present:
-            raise InputError(f"the file has {what}; expected a chain that only motors and gravity move")
+            raise InputError(f"the file has {what}; expected a chain moved only by motors and gravity")
 
 
 def _model(source: Any) -> tuple[Any, Any, dict[str, float], list[str]]:
-    """Returns MuJoCo, its model, and what a URDF states besides: largest rates by joint, joints with a transmission."""
+    """Returns MuJoCo, its model, and two facts from a URDF: largest rates by joint, and joints with a transmission."""
     if isinstance(source, Path) or (isinstance(source, str) and not source.lstrip().startswith("<")):
         root = parse_robot(Path(source))
         mujoco, model = compile_robot(Path(source), root, (), inertias=True)[:2]
         if root.tag != "robot":
             return mujoco, model, {}, []
-        # A URDF by itself states no integrator, and MuJoCo's default has errors that no rigid body makes.
+        # A URDF states no integrator, and MuJoCo's default adds errors beyond rigid-body motion.
         if root.find("mujoco/option") is None:
             model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
         return mujoco, model, velocity_limits(root), driven_joints(root)
@@ -310,7 +310,7 @@ def _motors(model: Any, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
             if limited or not (low == high == 0 or low < high):
                 if not -np.inf < low < 0 < high < np.inf:
                     raise InputError(
-                        f"actuator '{name}' has limits {low:g} to {high:g}; expected finite ones with zero between"
+                        f"actuator '{name}' has limits {low:g} to {high:g}; expected finite limits around zero"
                     )
                 largest[joint] = min(largest[joint], scale * min(-low, high))
     return controls, largest

@@ -22,7 +22,7 @@ def gymnasium_plant(
 
     Args:
         env: with `reset(seed=)` and `step(action)`; its start is near the layout's hanging posture.
-        layout: layout of the plant; its rate is that of the environment's steps.
+        layout: layout of the plant; its rate is the step rate of the environment.
         coordinates: observation -> q [d]; angles may be wrapped.
         action: controls [m] -> action.
         seed: seed of the first reset.
@@ -31,7 +31,7 @@ def gymnasium_plant(
         InputError: the environment has no reset or no step.
     """
     if not (callable(getattr(env, "reset", None)) and callable(getattr(env, "step", None))):
-        raise InputError(f"env is a {type(env).__name__}; expected an environment of Gymnasium with reset and step")
+        raise InputError(f"env is a {type(env).__name__}; expected a Gymnasium environment with reset and step")
     state: dict[str, Any] = {"steps": 0, "seed": seed, "seen": None}
 
     def reset() -> None:
@@ -54,12 +54,11 @@ def hardware_plant(
 ) -> Plant:
     """Returns hardware as a plant: `act` writes the controls and waits for the next sample of the clock.
 
-    A missed sample is not made up for: the next follows a period after the late one, and `guarded` stops the plant if
-    it was too late.
+    After a late sample the next one follows a period later; `guarded` stops the plant if a sample is too late.
 
     Args:
         layout: layout of the plant.
-        reset: brings the plant to rest near hanging, and returns when it is there.
+        reset: brings the plant to rest near hanging before it returns.
         read: () -> coordinates [d].
         write: (controls [m]) -> nothing.
         clock: () -> time, s.

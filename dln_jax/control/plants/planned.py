@@ -2,11 +2,11 @@
 
     min  |error_N|² weight + integral lambda (effort |u / u_max|² + rates²) dt,   |u| <= `SHARE` u_max
 
-in the units of `scales`. Guesses of the controls are drawn, and improved together by iterative linear-quadratic
-regulators. Plans with the smallest feedback gains come first, because gains are large where the motors hardly reach the
-passive joints, and there a phase error reverses their sign. The feedback is a time-varying regulator for the samples;
-its cost to go at the end is that of the regulator at the goal. A regulator about hanging brings the plant to rest
-first, and again if the goal is lost.
+in the units of `scales`. Random guesses of the controls are improved together by iterative linear-quadratic regulators.
+Plans with the smallest feedback gains come first: gains are large where the motors hardly move the passive joints, and
+a phase error reverses their sign there. The feedback is a time-varying regulator for the samples; its final cost to go
+comes from the regulator at the goal. A regulator about hanging brings the plant to rest first, and again if the goal is
+lost.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,29 +30,30 @@ from dln_jax.control.trajectories import Plan, TrajectoryProblem, first_plan
 from dln_jax.types import InputError
 
 DURATIONS = (8.0, 14.0, 20.0)
-"""Durations of plans, in units of 1 / lambda; a longer one is tried if no shorter one arrives."""
+"""Durations of plans, in units of 1 / lambda, tried from short to long until a plan arrives."""
 FINENESS = 15.0
 """Steps of a plan per 1 / lambda."""
 SHARE = 0.7
-"""Largest share of the motors' limits in a plan; the rest is for feedback."""
+"""Largest share of the motors' limits in a plan; the rest remains for feedback."""
 INSIDE = 0.8
 """A plan should stay within this share of the limits of the coordinates and rates."""
 GUESSES, ITERATIONS, LENGTHS = 16, 100, 0.5 ** np.arange(6)
 CLOSE = 0.1
 """Largest error at the end of a plan, in units of the coordinates."""
 EFFORTS = (1.0, 0.1)
-"""Weights of the controls in alternate plans: gentle plans, and firm ones."""
+"""Weights of the controls in alternate plans: gentle and firm plans."""
 AT_END, RATES, POSTURE, BEYOND = 300.0, 0.003, 0.02, 100.0
-"""Weights of the errors at the end, of the rates, of active coordinates away from the goal (where an acrobot's motor
-hardly reaches its passive joint), and of coordinates and rates outside their share of the limits."""
+"""Weights of the errors at the end, of the rates, of active coordinates away from the goal (an acrobot's motor hardly
+moves its passive joint there), and of coordinates and rates outside their share of the limits."""
 READY = -1
 """Sample number of a plan while the plant hangs and waits for its start."""
 CALM, PATIENCE = 1 / 36, 4
 """Share of the level below which a lost plan starts again: half a standard deviation of the starts instead of three,
-because it may have been lost by starting too far away. After `PATIENCE` durations of the plan the whole level counts,
-in case friction keeps the plant away."""
+because too distant a start may have caused the loss. After `PATIENCE` durations of the plan the whole level counts, in
+case friction keeps the plant away."""
 LOST = 1.0
-"""Distance of an angle from the plan or the goal, rad, beyond which the plant hangs and starts again."""
+"""Largest distance of an angle from the plan or the goal, rad; beyond it, the plant returns to hanging and starts
+again."""
 HORIZON, COARSENESS = 6.0, 7.0
 """Duration of repeated plans in units of 1 / lambda, and their steps per 1 / lambda."""
 MORE, LESS_AT_END, SOON = 0.9, 100.0, 1.0
@@ -70,7 +71,7 @@ class TrackedPlan(NamedTuple):
     S: Float[Array, "n n"]
     """Cost to go at the start."""
     level: Any
-    """Cost to go from hanging below which the plan starts."""
+    """Largest cost to go, from hanging, at which the plan starts."""
     regulator: Regulator
     """Regulator at the goal."""
     hanging: Regulator
@@ -82,19 +83,19 @@ def plan_problem(
     """Returns the problem of plans to the goal.
 
     Args:
-        upright: the model; friction of its driven joints is left to the compensation.
+        upright: the model. The compensation removes the friction of its driven joints.
         effort: weight of the controls; it may be traced.
         every: samples per step.
         share: largest share of the motors' limits.
         at_end: weight of the errors at the end.
-        soon: weight of the distance from the goal on the way. If it is not zero, passive joints may reach the goal
-            after any number of turns.
+        soon: weight of the distance from the goal on the way. If positive, passive joints may reach the goal after any
+            number of turns.
     """
     layout, size, units = upright.layout, upright.forces, _units(upright)
     d, dt, goal = len(layout.joints), every / layout.rate, np.asarray(upright.at.x)
     low, high = inner_ranges(layout, INSIDE)
     fastest = INSIDE * layout.limits.rate
-    # Driven joints must not make extra turns, because their cables might not.
+    # Driven joints must not make extra turns, because of their cables.
     free = circular(layout.joints, 2 * d) & np.isin(np.arange(2 * d), upright.parts.passive) & (soon > 0)
 
     def off(x: Array) -> Array:
@@ -120,7 +121,7 @@ def plan_problem(
 
 
 def plans_of(upright: Upright, *, seed: int = 0) -> list[Plan]:
-    """Returns the plans from hanging that reach the goal, least sensitive first; raises `InputError` if none does."""
+    """Returns the plans from hanging that reach the goal, least sensitive first; raises `InputError` without any."""
     every, size, fall = steps_of(upright), upright.forces, upright.scales.fall
     goal, units = np.asarray(upright.at.x), _units(upright)
 
@@ -144,13 +145,13 @@ def plans_of(upright: Upright, *, seed: int = 0) -> list[Plan]:
             return [jax.tree.map(lambda leaf: leaf[k], plans) for k in good]  # noqa: B023
         nearest = np.nanmin([nearest, *off])
     raise InputError(
-        f"no plan of {DURATIONS[-1] / fall:.3g} s leads from hanging to the goal: the best ends {nearest:.2g} of a "
-        "coordinate's size away; try a stronger motor or wider limits"
+        f"no plan of {DURATIONS[-1] / fall:.3g} s leads from hanging to the goal: the best misses it by {nearest:.2g} "
+        "times the size of a coordinate; try a stronger motor or wider limits"
     )
 
 
 def inner_ranges(layout: Layout, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the ends [d] of the middle share of every finite range of the coordinates; infinite ends stay."""
+    """Returns the ends [d] of the middle share of every coordinate range; infinite ends stay."""
     low, high = layout.limits.position.T
     spare = np.where(np.isfinite(high - low), (1 - share) / 2 * (high - low), 0.0)
     return low + spare, high - spare
@@ -162,7 +163,7 @@ def steps_of(upright: Upright, fineness: float = FINENESS) -> int:
 
 
 def with_feedback(upright: Upright, plans: Sequence[Plan], numbers: Sequence[Mapping[str, float]]) -> list[TrackedPlan]:
-    """Returns plans from hanging with their regulators, each from numbers without units; raises as `lqr`."""
+    """Returns plans from hanging with their regulators, each from dimensionless numbers; raises as `lqr`."""
     layout, every, d = upright.layout, steps_of(upright), len(upright.layout.joints)
     step, dt = integrated(_compensated(upright), 1 / layout.rate), 1 / layout.rate
     rest, spread = jnp.asarray(upright.rest), jnp.asarray(spread_of(layout))
@@ -192,7 +193,7 @@ def with_feedback(upright: Upright, plans: Sequence[Plan], numbers: Sequence[Map
 
 
 def follower(upright: Upright, plan: TrackedPlan) -> Controller:
-    """Returns the controller of states x that swings up by a plan, whose arrays may be traced."""
+    """Returns the controller of states x that swings up by a plan; the arrays of the plan may be traced."""
     joints, last = upright.layout.joints, len(plan.u)
     angles = np.array([kind == "revolute" for kind in joints])
     plan = jax.tree.map(jnp.asarray, plan)
@@ -220,8 +221,8 @@ def follower(upright: Upright, plan: TrackedPlan) -> Controller:
 def by_repeated_plans(upright: Upright, numbers: SwingUpNumbers) -> Controller:
     """Returns the controller of states x by repeated plans (`recovery_by_plans`) and the numbers' regulator and level.
 
-    Plans have a cost of the distance from the goal on the way, so that they do not put it off, and any number of turns
-    of the passive joints. They start from three first guesses: no control, and swings that begin to either side.
+    A cost of the distance from the goal on the way keeps plans from delaying. Passive joints may make any number of
+    turns. There are three first guesses: no control, and swings that begin to either side.
     """
     layout, fall, every = upright.layout, upright.scales.fall, steps_of(upright, COARSENESS)
     dt, joints, friction = every / layout.rate, layout.joints, friction_of(upright)
@@ -245,7 +246,8 @@ def _units(upright: Upright) -> np.ndarray:
 
 
 def _compensated(upright: Upright) -> Field:
-    """Returns the field of a plant with friction at the passive joints only; that of the others is compensated."""
+    """Returns the field of a plant with friction at the passive joints only; the compensation removes the other
+    friction."""
     B = upright.layout.actuation
     driven = (B != 0).any(axis=1)
 

@@ -1,8 +1,8 @@
-"""A plant of any origin to swing up: four callables, and what must be known about it beforehand.
+"""A plant of any origin to swing up: four callables, and the facts known beforehand.
 
-The callables are impure, as hardware is. `act` commands the controls and returns at the next sample, which a simulated
-plant reaches at once; `guarded` stops a plant at its limits, and `run` closes the loop. `simulated` makes a plant of
-the step function of any simulator, with the noise, the resolution and the delay of hardware.
+The callables are impure, like hardware. `act` sends the controls and returns at the next sample, at once for a
+simulated plant. `guarded` stops a plant at its limits, and `run` closes the loop. `simulated` makes a plant from the
+step function of any simulator, with the noise, the resolution and the delay of hardware.
 """
 
 import itertools
@@ -22,11 +22,11 @@ from dln_jax.types import InputError, JointKind, Needs, require_positive
 TURNS = 8
 """Number of initial angles of a joint for the search of the highest and the lowest posture."""
 LEVEL = 1e-3
-"""Smallest change of energy by a passive joint that counts as gravity, as a share of the range of the energies."""
+"""Smallest energy change by a passive joint that counts as gravity, as a share of the energy range."""
 
 
 class Limits(NamedTuple):
-    """Limits of safe operation; the plant is stopped when it leaves them."""
+    """Limits of safe operation; a plant outside them is stopped."""
 
     control: Float[np.ndarray, "m 2"]
     """Lower and upper limits of the motors, N m or N; finite."""
@@ -35,13 +35,13 @@ class Limits(NamedTuple):
     rate: Float[np.ndarray, " d"]
     """Largest rates, 1/s or m/s; infinite for none."""
     stopping: float = 0.0
-    """Time that a brake needs, s: at its present rate the plant must stay within the positions for so long."""
+    """Braking time, s: at its present rate the plant must stay within the positions for this time."""
     late: float = 2.0
     """Largest time between two answers, in samples."""
 
 
 class Layout(NamedTuple):
-    """Facts about a plant that are known before it has moved; masses and lengths are not among them."""
+    """Facts about a plant known before it moves; masses and lengths are not needed."""
 
     joints: tuple[JointKind, ...]
     actuation: Float[np.ndarray, "d m"]
@@ -74,7 +74,7 @@ class Plant(NamedTuple):
     time: Callable[[], float]
     """() -> time in s, by the plant's clock."""
     kick: Callable[[Any], None] | None = None
-    """Adds to the rates [d], as a push does; `None` for plants that cannot."""
+    """Adds to the rates [d], like a push; `None` if the plant cannot."""
 
 
 SPREAD = 0.1
@@ -82,7 +82,7 @@ SPREAD = 0.1
 ACTIVE_SPREAD = 0.02
 """The same for the coordinates with a motor."""
 ROOM = 0.2
-"""Least distance of the goal from the limits of a revolute joint, rad: as far as a plant that is up may be away."""
+"""Least distance of the goal from the limits of a revolute joint, rad: the tolerance of a plant that is up."""
 
 
 def layout(
@@ -106,7 +106,7 @@ def layout(
         joints: kinds, "revolute" or "prismatic" [d].
         actuated: numbers of the coordinates with a motor, from 0.
         goal: posture to hold [d], rad or m.
-        hanging: posture of rest [d].
+        hanging: posture at rest [d].
         rate: sampling rate, Hz.
         control: largest size of the controls, one for all motors or one each, N m or N.
         position: limits [d, 2], rad or m; by default none.
@@ -114,23 +114,23 @@ def layout(
         stopping: as `Limits.stopping`.
         late: as `Limits.late`.
         names: names of the coordinates; by default joint_0, joint_1, ...
-        passive: whether a coordinate without a motor is required, as for a swing-up.
+        passive: require a coordinate without a motor, as for a swing-up.
 
     Raises:
         InputError: shapes do not agree, a motor's coordinate does not exist, there is no motor or no passive
-            coordinate, a limit is not positive, answers are late after one sample, a posture is outside the limits, or
-            the goal of a swing-up is at the end of a range.
+            coordinate, a limit is not positive, `late` is at most one sample, a posture is outside the limits, or the
+            goal of a swing-up is at the end of a range.
     """
     require_positive(rate=rate)
     if not late > 1:
-        raise InputError(f"late is {late}; expected more than 1, because answers are a sample apart")
+        raise InputError(f"late is {late} samples; expected more than 1, because answers come once per sample")
     d, chosen = len(joints), sorted(set(actuated))
     names = tuple(names) or tuple(f"joint_{k}" for k in range(d))
     if any(not 0 <= k < d for k in chosen):
         raise InputError(f"actuated is {list(actuated)}; expected numbers of coordinates from 0 to {d - 1}")
     if not chosen or (passive and len(chosen) == d):
-        which = "no joint has a motor" if not chosen else f"all {d} joints have a motor, and none is passive"
-        raise InputError(f"{which}; a swing-up needs a plant with a motor and with a joint without one")
+        which = "no joint has a motor" if not chosen else f"all {d} joints have a motor"
+        raise InputError(f"{which}; a swing-up needs a motor and a passive joint")
     B = np.eye(d)[:, chosen]
     size = _sized("control", control, len(chosen))
     if not (np.isfinite(size) & (size > 0)).all():
@@ -140,12 +140,12 @@ def layout(
         raise InputError(f"position is {ranges.tolist()}; expected lower and upper limits of {d} coordinates")
     rates = _sized("speed", speed, d)
     if not (rates > 0).all() or not stopping >= 0:
-        raise InputError(f"speed is {rates.tolist()} and stopping {stopping}; expected positive limits, and a time")
+        raise InputError(f"speed is {rates.tolist()} and stopping {stopping}; expected positive rates and a time >= 0")
     needs = Needs(joints=tuple(joints))  # checks the kinds
     postures = {"goal": _sized("goal", goal, d), "hanging": _sized("hanging", hanging, d)}
     for name, q in postures.items():
         if not np.isfinite(q).all() or (q < ranges[:, 0]).any() or (q > ranges[:, 1]).any():
-            raise InputError(f"{name} is {q.tolist()}, outside the limits {ranges.tolist()}; choose a posture within")
+            raise InputError(f"{name} is {q.tolist()}, outside the limits {ranges.tolist()}; choose a posture inside")
     room = np.min(np.abs(ranges - postures["goal"][:, None]), axis=1)
     least = np.where([kind == "revolute" for kind in needs.joints], ROOM, 0.0)
     if passive and (room <= least).any():
@@ -175,14 +175,14 @@ def simulated(
     hardware: Hardware = Hardware(),  # noqa: B008
     seed: int = 0,
 ) -> Plant:
-    """Returns a plant that a simulator advances by one sample at a time, from random starts near hanging.
+    """Returns a simulated plant, advanced by one sample at a time from random starts near hanging.
 
     Args:
         layout: layout of the plant, with the limits of the controls.
         begin: (posture [d]) -> nothing; puts the simulator there, at rest.
         coordinates: () -> the true q [d].
         advance: (controls that act [m]) -> nothing; advances the simulator by a sample.
-        kick: (rates [d]) -> nothing; adds them to those of the simulator.
+        kick: (rates [d]) -> nothing; adds them to the rates of the simulator.
         hardware: noise, resolution and delay; its limits are not used.
         seed: seed of the starts and the noise.
     """
@@ -221,7 +221,7 @@ def plant_of(
     hardware: Hardware = Hardware(),  # noqa: B008
     seed: int = 0,
 ) -> Plant:
-    """Returns a plant that simulates a model of this library, such as that of a scene with friction.
+    """Returns a plant that simulates a model of this library, such as a scene with friction.
 
     Args:
         model: for example `dynamics(scene.closed_form)`.
@@ -253,10 +253,10 @@ def extremes(
     driven: Sequence[int],
     ranges: Float[np.ndarray, "d 2"],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the postures [d] of least and of greatest potential energy.
+    """Returns the postures [d] of least and greatest potential energy.
 
-    Slides stay in the middle of their ranges, or at zero without one: the energy is linear in them. Angles that do not
-    matter stay at zero. Without gravity both postures are the one nearest to zero.
+    Slides stay in the middle of their ranges, or at zero without a range, because the energy is linear in them. Angles
+    without effect stay at zero. Without gravity both are the posture nearest to zero.
 
     Args:
         potential: q [d] -> potential energy, J.
@@ -265,8 +265,8 @@ def extremes(
         ranges: limits of the coordinates, infinite for none.
 
     Raises:
-        InputError: the limits exclude every posture of the search, a passive joint is a slide, or gravity does not move
-            it.
+        InputError: the limits exclude every posture of the search, a passive joint is a slide, or gravity has no effect
+            on it.
     """
     from scipy.optimize import minimize
 
@@ -285,12 +285,12 @@ def extremes(
     size = float(np.ptp(energies))
     for k in sorted(set(range(len(joints))) - set(driven)):
         if not hinges[k]:
-            raise InputError(f"nothing holds the passive slide {k}; expected hinges without a motor only")
+            raise InputError(f"nothing holds the passive slide {k}; expected only hinges without a motor")
         moved = [
             abs(potential(q + np.pi / 2 * np.eye(len(joints))[k]) - e) for q, e in zip(grid, energies, strict=True)
         ]
         if not max(moved) > LEVEL * max(size, 1e-12):
-            raise InputError(f"gravity does not move the passive joint {k}; expected a plant that hangs and stands")
+            raise InputError(f"gravity does not move the passive joint {k}; expected a joint that can hang and stand")
     postures = []
     for sign in (1.0, -1.0):
         ties = np.flatnonzero(sign * energies <= (sign * energies).min() + 1e-9 * max(size, 1e-12))

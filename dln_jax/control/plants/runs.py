@@ -1,6 +1,6 @@
-"""Closed loop of plants that are callables: one plant, or several in step, which share every call of the controller.
+"""Closed loop of callable plants: one plant, or several in step with one call of the controller for all.
 
-A plant is stopped when it leaves its limits of position, rate or control, or its answers are late or not finite.
+A plant is stopped if it leaves its limits of position, rate or control, or if an answer is late or not finite.
 """
 
 import gc
@@ -21,14 +21,14 @@ from dln_jax.control.state_space import saturated
 from dln_jax.types import InputError, require_positive
 
 TOLERANCE = 0.2
-"""Largest distance of every angle from the goal that counts as up, rad."""
+"""Largest distance of an angle from the goal that counts as up, rad."""
 HELD = 1.0
-"""Time at the end for which a plant must stay up, s."""
+"""A plant must stay up for this time at the end, s."""
 
 NEAR = 1.0
-"""Largest angle of a passive joint from hanging at a start, rad: a pole that still stands does not hang."""
+"""Largest angle of a passive joint from hanging at a start, rad: a standing pole is refused."""
 SPAN = 5
-"""Samples over which a rate is measured, so that an encoder step does not look like a high rate."""
+"""Number of samples for measuring a rate, so that an encoder step does not look like a high rate."""
 ROUNDING = 1e-9
 
 
@@ -37,26 +37,26 @@ Act = Callable[[Any, Any, Any], tuple[Any, Any]]
 
 
 class PlantRun(NamedTuple):
-    """Measurements and commands of N samples; fewer than asked for if the plant was stopped."""
+    """Measurements and commands of N samples; fewer than requested if the plant was stopped."""
 
     t: Float[np.ndarray, " N"]
-    """Times of the measurements by the plant's clock, from the first one on, s: hardware is never exactly on time."""
+    """Times of the measurements since the first one, by the plant's clock, s: hardware is never exactly on time."""
     y: Float[np.ndarray, "N d"]
     u: Float[np.ndarray, "N m"]
     """Commands, within the limits."""
     stopped: str = ""
-    """Why it was stopped; empty if it was not."""
+    """Reason for a stop; empty without one."""
 
 
 class Stopped(RuntimeError):
-    """The plant was stopped, with zero controls; the message says why. It acts again after a reset."""
+    """The plant was stopped, with zero controls; the message gives the reason. It acts again after a reset."""
 
 
 def guarded(plant: Plant) -> Plant:
-    """Wraps a plant so that it stops, with zero controls and `Stopped`, once it leaves its limits or answers wrongly.
+    """Wraps a plant so that it stops, with zero controls and `Stopped`, outside its limits or after a wrong answer.
 
-    Measured angles may be wrapped; those of the guarded plant are continuous. Its time is that of the last answer. The
-    reset raises `InputError` for a start outside the limits or far from hanging, or an answer of another shape.
+    Measured angles may be wrapped; the guarded plant unwraps them. Its time is the time of the last answer. The reset
+    raises `InputError` for a start outside the limits or far from hanging, or an answer of another shape.
     """
     layout, limits = plant.layout, plant.layout.limits
     d, m = layout.actuation.shape
@@ -107,12 +107,12 @@ def guarded(plant: Plant) -> Plant:
         if not np.isfinite(q).all():
             raise InputError(f"the plant starts at {q.tolist()}; expected finite coordinates: check its sensors")
         if why := outside(q, np.zeros(d)):
-            raise InputError(f"{why}: the start is outside the limits; reset the plant to a posture within")
+            raise InputError(f"{why}: the start is outside the limits; reset the plant to a posture inside")
         away = np.where(swinging, np.abs(q - layout.hanging), 0.0)
         if away.max() > NEAR:
             raise InputError(
                 f"'{layout.names[int(np.argmax(away))]}' starts {away.max():.3g} rad from hanging; expected at most "
-                f"{NEAR:g}: let the reset return when the plant has come to rest there, or check the layout's hanging"
+                f"{NEAR:g}: let the reset wait until the plant rests there, or check `hanging` in the layout"
             )
         seen.append((plant.time(), q))
 
@@ -174,7 +174,7 @@ def run(
         act: result of `compiled`.
         memories: memories of the controller before the first sample, one for each plant along the leading axis.
         seconds: duration.
-        push: acts on every plant that still runs; by default none.
+        push: applied to every running plant; by default none.
 
     Raises:
         InputError: a start is outside the limits, an answer has another shape, or plants without `kick` are pushed.
@@ -218,7 +218,7 @@ def run(
 
 @contextmanager
 def _short_collections() -> Iterator[None]:
-    """Leaves the objects that are there out of garbage collections: to go through those of JAX can take samples."""
+    """Excludes existing objects from garbage collection: going through the objects of JAX can take several samples."""
     alone = not gc.get_freeze_count()
     gc.freeze()
     try:
@@ -229,7 +229,7 @@ def _short_collections() -> Iterator[None]:
 
 
 def _each(going: list[int], k: int, lengths: Any, reasons: list[str], do: Callable[[int], Any]) -> list[int]:
-    """Calls `do` for the plants that run; returns those that still run."""
+    """Calls `do` for the running plants; returns the plants that still run."""
     left = []
     for i in going:
         try:
@@ -249,7 +249,7 @@ class Trials(NamedTuple):
     """Swing-ups from n starts."""
 
     seconds: Float[np.ndarray, " n"]
-    """Time after which the plant stays up until the end, s; infinite if it does not."""
+    """Time from which the plant stays up until the end, s; infinite if it does not."""
     stopped: tuple[str, ...]
     """Reasons why runs were stopped."""
 

@@ -2,15 +2,15 @@
 
 1. Numbers without units (`swing_up.RANGES`) are drawn; scales of the model turn them into gains and a regulator.
 2. Every set is tried from near hanging, with the hardware's limits, resolution, noise and delay, and with motors that
-   are stronger or weaker than the model says. The weight is wrong by the share `WEIGHT` of that, in the opposite
-   direction; stronger motors also act later, by the share `LATE` of a sample.
+   are stronger or weaker than in the model. The weight differs in the opposite direction, by the share `WEIGHT` of this
+   error. Stronger motors also act later, by the share `LATE` of a sample.
 3. The best sets are tried again with more errors, and from more starts. The margin of a set is the largest error up to
-   which every trial succeeds. Among the sets that come up from most starts, with the largest margin and not much slower
-   than the fastest, the one whose controls change least at the goal is chosen.
-4. Plans with feedback (`planned`) are tried first, and taken if they tolerate every error. Otherwise energy laws are
-   tried as well, with correct models in the first round, because few sets work. One with a margin of `LEAST` or more is
-   taken: it acts in any state, and a wrong model only costs it time but throws a plan off. Otherwise the larger margin
-   decides. If the plant must recover from pushes by plans, repeated plans are tried instead.
+   which every trial succeeds. The candidates come up from most starts, have the largest margin and are not much slower
+   than the fastest. The chosen set changes its controls least at the goal.
+4. Plans with feedback (`planned`) are tried first, and chosen if they tolerate every error. Otherwise energy laws are
+   tried too, with correct models in the first round, because few sets work. An energy law with a margin of `LEAST` or
+   more is chosen, because it acts in any state, and a wrong model makes it slower but makes a plan fail. Otherwise the
+   larger margin decides. For recovery from pushes by plans, repeated plans are tried instead.
 """
 
 from collections.abc import Callable, Mapping
@@ -43,33 +43,33 @@ ERRORS = (0.0, 0.1, -0.1, 0.2, -0.2, 0.3, -0.3, 0.4)
 WEIGHT = 0.125
 """Relative error of gravity, divided by that of the motors' strength."""
 LATE = 0.5
-"""Additional delay of stronger motors, in samples: the law may take longer to compute than the one that was active
-during the recording."""
+"""Additional delay of stronger motors, in samples: the law may take longer to compute than the law during the
+recording."""
 SLOWER = 1.5
-"""Largest time to the goal of the chosen set, divided by that of the fastest with its margin."""
+"""Largest time to the goal of the chosen set, relative to the fastest set with its margin."""
 STARTS = 2
 """Smallest number of starts of a set with each error in the second round."""
 FINALISTS = 8
 ROUNDS = 4
-"""Largest number of first rounds until `FINALISTS` sets have succeeded."""
+"""Largest number of first rounds before `FINALISTS` sets have succeeded."""
 WITHIN = 0.5
-"""A trial must end within this share of the tolerance: a plant whose dry friction sticks hunts farther from the goal
-than the model, whose friction is smooth."""
+"""A trial must end within this share of the tolerance: real sticking friction causes larger limit cycles than the
+smooth friction of the model."""
 RESERVE = 0.95
-"""A trial must keep within this share of the ranges and of the largest rates: a plant starts more often, and from
-farther away, than the trials."""
+"""A trial must stay within this share of the ranges and the largest rates: a plant starts more often, and from farther
+away, than the trials."""
 SECONDS, FALLS = 6.0, 26.0
-"""Duration of a trial, s, and the least one in units of 1 / lambda: the longest plan, with time to come to rest."""
+"""Duration of a trial, s, and its minimum in units of 1 / lambda: the longest plan, with time to come to rest."""
 LEAST = 0.1
-"""Smallest margin of an energy law that is taken in place of a plan."""
+"""Smallest margin of an energy law chosen instead of a plan."""
 PLANS = 8
-"""Largest number of plans that are tried with feedback."""
+"""Largest number of plans tried with feedback."""
 SETS_OF_REPEATED_PLANS = 2
-"""Few, because trials of repeated plans take far longer than others: each of them plans at every step of a plan."""
+"""Number of sets of repeated plans: few, because each trial plans again at every step of a plan."""
 
 
 class SwingUp(NamedTuple):
-    """A controller that swings the model up, and how safely."""
+    """A controller that swings the model up, and its safety margin."""
 
     controller: Controller
     """Controller of the measurements."""
@@ -80,11 +80,11 @@ class SwingUp(NamedTuple):
     trials: int
     """Number of simulated trials."""
     worked: float
-    """Share of the sets of the first rounds whose trials all succeeded."""
+    """Share of sets in the first rounds that succeeded in all trials."""
     margin: float
-    """Relative error of the motors' strength up to which every trial of this set succeeded."""
+    """Largest relative error of the motors' strength at which every trial of this set still succeeded."""
     seconds: float
-    """Median time until the goal at the model's own strength, s."""
+    """Median time to the goal with the motors' strength of the model, s."""
 
 
 def tune(
@@ -104,14 +104,14 @@ def tune(
     Args:
         model: known or learned, with friction if the plant has it.
         layout: layout of the plant: its motors, goal, limits and rate.
-        hardware: noise, resolution and delay; the limits are those of the layout.
-        estimator: makes a controller of measurements from one of states, such as `by_filter`; by default differences.
+        hardware: noise, resolution and delay; the layout gives the limits.
+        estimator: turns a controller of states into one of measurements, such as `by_filter`; by default differences.
         sets: number of sets in a first round.
-        seconds: duration of a trial, within which a plant must come up and stay for a second; by default 6 s, or longer
-            for large plants, which fall slowly.
-        late: share of a sample by which motors act later than the hardware's whole number of samples.
+        seconds: duration of a trial; the plant must come up and stay up for a second. By default 6 s, or longer for
+            large plants, which fall slowly.
+        late: additional delay of the motors beyond the hardware's whole samples, as a share of a sample.
         seed: seed of the sets, the starts and the noise.
-        recover: "plans" for a law that plans again from where a push leaves the plant, or "swing-up".
+        recover: "plans" for a law that plans again from the state after a push, or "swing-up".
 
     Raises:
         InputError: `swing_up` refuses the model, no set swings it up, or the recovery is unknown.
@@ -119,7 +119,7 @@ def tune(
     require_positive(sets=sets)
     require_seed(seed)
     if seconds is not None and not seconds > HELD:
-        raise InputError(f"seconds is {seconds}; expected more than the {HELD:g} s for which a plant has to stay up")
+        raise InputError(f"seconds is {seconds}; expected more than {HELD:g} s, the time that a plant must stay up")
     require_recovery(recover)
     upright, estimator = upright_of(model, layout), estimator or by_differences(layout)
     seconds = max(SECONDS, FALLS / upright.scales.fall) if seconds is None else seconds
@@ -153,7 +153,7 @@ class Way(NamedTuple):
     errors: tuple[float, ...]
     """Errors in the first round, one trial each."""
     most_sets: int | None = None
-    """Largest number of sets in a round; by default as many as are asked for."""
+    """Largest number of sets in a round; by default the requested number."""
 
 
 def _by_energy(upright: Upright, seed: int) -> Way:
@@ -183,7 +183,7 @@ RECOVERIES: Mapping[str, tuple[Callable[[Upright, int], Way], ...]] = {
     "swing-up": (_by_plan, _by_energy),
     "plans": (_by_repeated_plans,),
 }
-"""Ways that are tried, by how the plant comes up again after a push: as from hanging, or by plans from where it is."""
+"""Recovery after a push -> methods to try: swing up from hanging again, or plan from the present state."""
 
 
 def require_recovery(name: str) -> None:
@@ -236,9 +236,9 @@ def _chosen(
     good = np.isfinite(times).all(axis=1)
     if not good.any():
         raise InputError(
-            f"none of {len(settings)} sets of numbers swings the model up by {way.name} within {seconds:.3g} s and its "
-            f"limits in {trials} trials, of which {np.isfinite(times).mean():.0%} came up; try a stronger motor, wider "
-            "limits, more time or a better model"
+            f"no set of numbers swings the model up by {way.name} within {seconds:.3g} s and its limits "
+            f"({len(settings)} sets, {trials} trials, {np.isfinite(times).mean():.0%} came up); try a stronger motor, "
+            "wider limits, more time or a better model"
         )
     best = np.argsort(np.where(good, times.max(axis=1), np.inf))[: min(finalists, int(good.sum()))]
     starts = max(STARTS, lanes // (finalists * len(ERRORS)))
@@ -254,9 +254,8 @@ def _chosen(
     choice = int(np.lexsort((np.median(changes[:, 0], axis=1), slow, ~equal))[0])
     if margins[choice] < 0:
         raise InputError(
-            f"of {trials} trials by {way.name}, no set of numbers brings all {starts} starts up at the model's own "
-            f"strength: the best reaches {np.isfinite(final[:, 0]).mean(axis=1).max():.0%}; try a stronger motor or "
-            "wider limits"
+            f"no set of numbers swings the model up by {way.name} from all {starts} starts ({trials} trials): the best "
+            f"succeeds from {np.isfinite(final[:, 0]).mean(axis=1).max():.0%}; try a stronger motor or wider limits"
         )
     selected = jax.tree.map(jnp.asarray, settings[best[choice]])
     return SwingUp(
@@ -276,8 +275,8 @@ def trial_of(
 ) -> Callable[[Any, Array, Array, Array], tuple[Array, Array]]:
     """Returns (traced settings, start [d], error of the model, key) -> (seconds, changes).
 
-    The time until the goal is infinite if the plant does not stay there; the changes of the controls from sample to
-    sample are root mean squares over the last second, relative to the limits.
+    The time to the goal is infinite if the plant does not stay there. The changes are root mean squares of the control
+    increments over the last second, relative to the limits.
     """
     B, d = layout.actuation, len(layout.joints)
     lower, upper = layout.limits.control.T
@@ -308,7 +307,7 @@ def trial_of(
         last = jnp.max(jnp.where(away, run.t + 1 / layout.rate, 0.0))
         fine = last <= seconds - HELD
         if has_limits:
-            # The guard sees measured rates: with noise, a plan that just keeps within the limits would be stopped.
+            # The guard uses measured rates: with noise, it would stop a plan that barely respects the limits.
             measured = (run.y[SPAN:] - run.y[:-SPAN]) * (layout.rate / SPAN)
             fine &= within(run.x[:, :d], run.x[:, d:]) & within(run.y[SPAN:], measured)
         changes = jnp.diff(run.u[-round(HELD * layout.rate) :], axis=0) / (upper - lower)
@@ -318,7 +317,7 @@ def trial_of(
 
 
 def _late(controller: Controller, share: Array, lower: np.ndarray, upper: np.ndarray) -> Controller:
-    """Returns a controller whose commands act late by a share of a sample, as their mean over each sample."""
+    """Returns a controller with commands delayed by a share of a sample, as their mean over each sample."""
 
     def act(memory: Any, t: Array, y: Array) -> tuple[Any, Array]:
         inner, before = memory
@@ -330,6 +329,6 @@ def _late(controller: Controller, share: Array, lower: np.ndarray, upper: np.nda
 
 
 def _margin(succeeded: np.ndarray) -> float:
-    """Returns the largest error up to which all trials succeeded; negative if there is none."""
+    """Returns the largest error up to which all trials succeeded; negative without any."""
     failed = [abs(error) for error, fine in zip(ERRORS, succeeded, strict=True) if not fine]
     return max((abs(error) for error in ERRORS if not failed or abs(error) < min(failed)), default=-1.0)

@@ -1,7 +1,7 @@
-"""The text of one C function under construction: lines, variables that hold nodes, and expressions that read them.
+"""The text of one C function under construction: lines, variables for nodes, and expressions that read them.
 
 A read takes an integer array of positions with one axis per surrounding loop (a scalar outside loops). Slices,
-transposes and gathers become indexing of that integer array, and constants are stored in the order of their reading.
+transposes and gathers become indexing of that integer array, and constants are stored in reading order.
 """
 
 from collections import Counter
@@ -41,12 +41,12 @@ class Source:
 
     precision: str
     finite: bool = False
-    """Whether arguments and intermediate results are finite."""
+    """True if arguments and intermediate results are finite."""
     loop_bound: int | None = None
-    """A loop without a known bound ends with NaN after this number of iterations."""
+    """Largest number of iterations of a loop without a known bound; it then ends with NaN."""
     tables: dict[tuple[str, bytes], tuple[str, np.ndarray]] = field(default_factory=dict)
     parts: dict[Any, "Called"] = field(default_factory=dict)
-    """Functions that others call, by the key of their program."""
+    """Called functions, by the key of their program."""
 
     @property
     def suffix(self) -> str:
@@ -54,7 +54,7 @@ class Source:
         return PRECISIONS[self.precision][2]
 
     def copy(self) -> "Source":
-        """Returns a copy that shares no containers, so that it can be discarded if a function is refused."""
+        """Returns a copy with its own containers, to discard if a function is refused."""
         return Source(**{attribute.name: copy(getattr(self, attribute.name)) for attribute in fields(self)})
 
     def table(self, numbers: np.ndarray, dtype: str) -> str:
@@ -74,20 +74,20 @@ class Body:
     program: Program
     plan: Plan
     inputs: dict[int, tuple[str, bool]]
-    """Name of every argument, and whether it is passed by value."""
+    """Name of every argument, and a flag for passing by value."""
     lines: list[str] = field(default_factory=list)
     operations: Counter[str] = field(default_factory=Counter)
-    """Upper bound on the operations on real numbers, by their names in `operations.OPERATIONS`."""
+    """Upper bound on the operations on real numbers, by name in `operations.OPERATIONS`."""
     unbounded: int = 0
     """Number of loops without a bound on their iterations; one iteration of each is counted."""
     stack: int = _FRAME
-    """Upper bound on the stack in bytes: variables, and what a compiler adds to them."""
+    """Upper bound on the stack in bytes: variables, and the compiler's additions."""
     calls: set[Any] = field(default_factory=set)
-    """Keys (in the source) of the functions that it calls, directly or indirectly."""
+    """Keys (in the source) of its direct and indirect callees."""
     names: dict[Node, str] = field(default_factory=dict)
-    """Names of the arrays that hold nodes."""
+    """Names of the arrays for nodes."""
     done: set[Node] = field(default_factory=set)
-    """Nodes that are written."""
+    """Written nodes."""
     _free: dict[tuple[Region, str, int], list[str]] = field(default_factory=dict)
     """Arrays that later lines may reuse, by region, kind and size."""
     _depth: int = 1
@@ -143,14 +143,14 @@ class Body:
         return self.names[node]
 
     def finished(self, step: Node) -> None:
-        """Frees the arrays whose last reader was this step."""
+        """Frees the arrays that no later step reads."""
         for source in sorted(self.plan.reads.get(step, ()), key=lambda node: node.number):
             self.plan.readers[source] -= 1
             if not self.plan.readers[source] and source in self.names:
                 self._free.setdefault((source.region, source.dtype, source.size), []).append(self.names[source])
 
     def name(self, node: Node) -> str:
-        """Returns the name of the array or scalar that holds a node."""
+        """Returns the name of the array or scalar of a node."""
         if node.op == "input":
             return self.inputs[node.attribute][0]
         if node.op == "const":
@@ -181,7 +181,7 @@ class Body:
         """Returns the C expression of an index, using a table unless it is linear in the loop variables."""
         every = steps(positions)
         terms = [f"{step} * {name}" if step != 1 else name for step, name in zip(every, names, strict=True) if step]
-        # The table omits axes along which the index moves by equal steps.
+        # The table omits axes with equal steps of the index.
         first = positions[tuple(slice(None) if step is None else 0 for step in every)]
         if first.ndim:
             left = [name for step, name in zip(every, names, strict=True) if step is None]
@@ -195,7 +195,7 @@ class Body:
         """Returns the C expression of constants, inside loops over these variables."""
         if numbers.size and ((numbers == numbers.flat[0]).all() or (numbers != numbers).all()):
             return literal(numbers.flat[0], self.source.precision, dtype)
-        # The table omits axes along which the numbers are equal.
+        # The table omits axes with equal numbers.
         kept = [axis for axis in range(numbers.ndim) if not (numbers == numbers.take([0], axis=axis)).all()]
         stored = numbers[tuple(slice(None) if axis in kept else 0 for axis in range(numbers.ndim))]
         index = self.index(np.arange(stored.size).reshape(stored.shape), [names[axis] for axis in kept])
@@ -207,7 +207,7 @@ class Body:
         return f"{'&' if by_value else ''}{self.name(node)}"
 
     def projected(self, loop: Node) -> set[int]:
-        """Returns the indices of a loop's results that something reads."""
+        """Returns the indices of a loop's results that are read."""
         return {node.attribute for node in self.plan.nodes if node.op == "project" and node.args[0] is loop}
 
     @property

@@ -1,6 +1,6 @@
 """Exports JAX functions with exact derivatives as C for CasADi's `external`, and hence for acados.
 
-CasADi (3.6 and later) takes the derivatives of a function f from these symbols of the same library:
+CasADi (3.6 and later) reads the derivatives of a function f from these symbols of the same library:
 
 | symbol | inputs | outputs |
 |---|---|---|
@@ -13,9 +13,9 @@ CasADi (3.6 and later) takes the derivatives of a function f from these symbols 
 Outputs among the inputs, and derivatives with respect to them, are declared without elements. All other matrices are
 dense and column-major; vectors are n x 1. A null pointer stands for an input of zeros or an unwanted output.
 
-The C loops over the directions of derivatives. Unrolled, it would be at most a third faster at two and four degrees of
-freedom, but the Hessian of forward dynamics would compile in 18 s instead of 2 s at four, and at seven it would exceed
-the stack sevenfold.
+The C code loops over the directions of derivatives. Unrolled code would be at most a third faster at two and four
+degrees of freedom. But at four, the Hessian of forward dynamics would compile in 18 s instead of 2 s, and at seven it
+would need seven times the stack.
 """
 
 import re
@@ -95,16 +95,16 @@ endif()
 def external_functions(
     name: str, functions: Mapping[str, Any], source: Source, *, stack: int, leave_out: bool = False
 ) -> tuple[Source, str, list[str]]:
-    """Returns the source of tables, the C of `casadi_NAME_F` and its derivatives for every F, and reasons for refusals.
+    """Returns the source with tables, the C text of `casadi_NAME_F` and its derivatives, and reasons for refusals.
 
     Args:
         functions: as for `export_c`.
         source: an empty source in double precision.
         stack: bytes of stack that a function may use.
-        leave_out: omit functions that CasADi cannot take, and return the reasons.
+        leave_out: omit functions that CasADi cannot use, and return the reasons.
 
     Raises:
-        InputError: CasADi cannot take a function: its arrays are not real or have more than two axes, a name is
+        InputError: CasADi cannot use a function: its arrays are not real or have more than two axes, a name is
             reserved, it has no arguments or derivatives, or it needs more stack.
     """
     text, largest, left_out = "", 1, []
@@ -117,11 +117,11 @@ def external_functions(
             signature = signature_of(function, examples, jax.eval_shape(function, *examples))
             inputs, outputs = ([_matrix(leaf) for leaf in leaves] for leaves in signature[:2])
             if not inputs:
-                raise InputError("there are no arguments to differentiate with respect to; export it without casadi")
+                raise InputError("the function has no arguments to differentiate by; export it without casadi")
             names = [start + leaf.name for start in ("", "out_", "adj_", "fwd_") for leaf in [*inputs, *outputs]]
             for word in (symbol, *names):
                 if re.search("__|_$", word) or word in ("null", "jac", "hess") or names.count(word) > 1:
-                    raise InputError(f"CasADi has no such name as {word}, or derivatives have it too; choose another")
+                    raise InputError(f"CasADi does not accept the name {word}, or a derivative uses it; choose another")
             symbols = _derivatives(inputs, outputs, _flat(function, examples))
             for prefix, (before, after, ways) in symbols.items():
                 kept, more = _function(kept, prefix + symbol, before, after, ways, stack)
@@ -140,14 +140,14 @@ def external_functions(
 def _matrix(leaf: Leaf) -> Leaf:
     if leaf.kind != "real" or len(leaf.shape) > 2 or 0 in leaf.shape:
         raise InputError(
-            f"{leaf.name} is {leaf.kind} of shape {list(leaf.shape)}; CasADi takes real numbers of at most two axes, "
-            "none of them empty, so export it without casadi"
+            f"{leaf.name} is {leaf.kind} of shape {list(leaf.shape)}; CasADi takes real arrays of at most two "
+            "non-empty axes, so export it without casadi"
         )
     return leaf._replace(shape=(*leaf.shape, 1, 1)[:2])
 
 
 def _flat(function: Function, examples: Sequence[Any]) -> Flat:
-    """Returns the function from all inputs to all outputs, as column-major vectors end to end."""
+    """Returns the function from all inputs to all outputs, as concatenated column-major vectors."""
     leaves, tree = jax.tree.flatten(examples)
     # Column-major order of a matrix is row-major order of its transpose.
     _, parts_of = ravel_pytree([np.zeros(leaf.shape[::-1]) for leaf in leaves])
@@ -163,7 +163,7 @@ def _forward(function: Flat, x: Array) -> Array:
     """Returns the transposed Jacobian [n, m] of a function from x [n] to y [m], one input at a time."""
 
     def along(k):
-        # A comparison, because rows of an identity matrix would be stored in an array.
+        # A comparison avoids storing an identity matrix.
         return jax.jvp(function, (x,), ((jnp.arange(x.size) == k).astype(x.dtype),))[1]
 
     return lax.map(along, jnp.arange(x.size))
@@ -178,7 +178,7 @@ def _reverse(function: Flat, x: Array) -> Array:
 def _derivatives(
     inputs: list[Leaf], outputs: list[Leaf], flat: Flat
 ) -> dict[str, tuple[list[Leaf], list[Leaf], list[Way]]]:
-    """Returns prefix -> inputs, outputs, and functions that compute them, the cheapest first."""
+    """Returns prefix -> inputs, outputs, and alternative functions for them, the cheapest first."""
     x_parts, y_parts = (
         [slice(*ends) for ends in pairwise(accumulate((prod(leaf.shape) for leaf in leaves), initial=0))]
         for leaves in (inputs, outputs)
@@ -211,7 +211,8 @@ def _derivatives(
         return [block for row in rows for block in row]
 
     def renamed(prefix, leaves):
-        # CasADi declares copies of outputs, and derivatives with respect to them, without elements: of no kind.
+        # CasADi declares copies of outputs, and derivatives with respect to them, without elements, and so without a
+        # kind.
         kind = "" if prefix == "out" else "real"
         return [leaf._replace(name=f"{prefix}_{leaf.name}", kind=kind) for leaf in leaves]
 
@@ -244,7 +245,7 @@ def _derivatives(
 def _function(
     source: Source, symbol: str, inputs: list[Leaf], outputs: list[Leaf], ways: Sequence[Way], stack: int
 ) -> tuple[Source, str]:
-    """Returns the source and the C text from the first method that can be compiled."""
+    """Returns the source and the C text of the first method that works."""
     dense = [k for k, leaf in enumerate(inputs) if leaf.kind]
     n = sum(prod(leaf.shape) for leaf in takewhile(lambda leaf: leaf.kind, inputs))
     names = {place: (f"in_{k}", False) for place, k in enumerate(dense)}
@@ -264,7 +265,7 @@ def _function(
             continue
         if body.stack > stack:
             kib = body.stack / 1024
-            reason = f"it would take {kib:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB"
+            reason = f"it needs {kib:.0f} KiB of stack; the limit is {stack // 1024} KiB"
             continue
         lines = [f"    const casadi_real *in_{k} = arg[{k}] ? arg[{k}] : zeros; (void)in_{k};" for k in dense]
         lines += ["    (void)res; (void)integers; (void)reals; (void)memory;", *body.lines, "    return 0;"]

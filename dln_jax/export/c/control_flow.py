@@ -1,7 +1,7 @@
-"""Lowering rules for loops and branches, which stay loops and branches in the program.
+"""Lowering rules for loops and branches, which remain loops and branches in the program.
 
-With finite arguments (`Program.finite`), elements of a loop's arrays that keep a known value are constants inside the
-loop and after it, so that structural zeros of a derivative cost nothing there.
+With finite arguments (`Program.finite`), loop elements with an unchanging known value are constants inside and after
+the loop. Structural zeros of a derivative then cost nothing.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,14 +28,14 @@ def _opened(program: Program, around: Sequence[Node], start: Sequence[Node] = ()
 
 
 def projections(program: Program, node: Node, results: Sequence[Any]) -> list[Node]:
-    """Returns the results of a loop, a branch or a call, which have these abstract values."""
+    """Returns the results of a loop, a branch or a call with these abstract values."""
     return [program.make("project", aval.shape, kind_of(aval.dtype), [node], k) for k, aval in enumerate(results)]
 
 
 def _with_known(
     program: Program, nodes: Sequence[Node], constants: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> list[Node]:
-    """Returns the nodes with constants, given by a mask [size] and numbers, in place of the elements under the mask."""
+    """Returns the nodes with the elements under a mask [size] replaced by constants."""
     results = [*nodes]
     for place, (node, (mask, numbers)) in enumerate(zip(nodes, constants, strict=True)):
         if mask.any():
@@ -48,9 +48,9 @@ def _with_known(
 def _steady(
     program: Program, start: Sequence[Node], carries: Sequence[Node], body: Callable[[list[Node]], list[Node]]
 ) -> tuple[list[Node], list[Node], list[tuple[np.ndarray, np.ndarray]]]:
-    """Returns a loop's inner carries, the results of its body, and masks and values of elements that never change.
+    """Returns a loop's inner carries, the results of its body, and masks and values of unchanging elements.
 
-    All elements known at the start are assumed constant; those that the body changes are dropped until none is left.
+    All elements known at the start are assumed constant; elements that the body changes are dropped until none changes.
     """
     steady = [known(node) for node in start]
     steady = [(mask & (program.finite and mask.size > 1), numbers) for mask, numbers in steady]
@@ -71,7 +71,8 @@ def _while(
     program: Program, *args: Node, cond_nconsts: int, cond_jaxpr: Any, body_nconsts: int, body_jaxpr: Any,
     results: Sequence[Any],
 ) -> list[Node]:  # fmt: skip
-    """Applies `while`; under `vmap` it turns while any row's condition holds, and other rows keep their carries."""
+    """Applies `while`; under `vmap` it iterates while the condition of any row holds, and other rows keep their
+    carries."""
     of_condition, of_body = args[:cond_nconsts], args[cond_nconsts : cond_nconsts + body_nconsts]
     start = args[cond_nconsts + body_nconsts :]
     region, carries = _opened(program, args, start)
@@ -103,7 +104,7 @@ def _scan(program: Program, *args: Node, length: int, jaxpr: Any, reverse: bool,
     def alike(outside: Sequence[Any], inside: Sequence[Any]) -> int:
         return sum(a.shape == b.aval.shape for a, b in zip(outside, inside, strict=True))
 
-    # Counted, because JAX releases store these numbers differently; stacked arrays have another shape inside.
+    # Counted here, because JAX releases store these numbers differently; stacked arrays have another shape inside.
     count = alike(results, inner.outvars)
     constants = alike(args, inner.invars) - count
     fixed, start, stacked = args[:constants], args[constants : constants + count], args[constants + count :]
@@ -124,13 +125,13 @@ def _scan(program: Program, *args: Node, length: int, jaxpr: Any, reverse: bool,
 
 
 def _slice_of(program: Program, array: Node, turn: Node, length: int) -> Node:
-    """Returns the slice of a stacked array in an iteration; elements that are equal in all slices are constants."""
+    """Returns the slice of a stacked array in an iteration; elements equal in all slices are constants."""
     size, shape, index = array.size // length, array.shape[1:], np.arange(array.size)
     mask, numbers = (part.reshape(length, size) for part in known(array))
     same = mask.all(0) & (numbers == numbers[0]).all(0) & program.finite
     whole = array
     if same.any() and array.op == "gather" and array.args[0].shape == array.shape and array.args[0].op != "const":
-        # The array whose elements these constants replace is in memory; this one would have to be copied.
+        # The original array is in memory; the array with constants would need a copy.
         whole = array.args[0] if ((np.ravel(array.value) == index) | np.tile(same, length)).all() else array
     first = program.elementwise("mul", turn, size)
     offsets = program.constant(np.arange(size).reshape(shape), "index")

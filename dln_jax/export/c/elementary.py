@@ -1,7 +1,7 @@
-"""Elementary functions in exported C: plain C99 without branches or tables, which compilers vectorise.
+"""Elementary functions in exported C: plain C99 without branches or tables, so that compilers vectorise them.
 
-A source that is compiled with -DDLN_OWN_ELEMENTARY has these functions; otherwise it calls <math.h>. They pay with
-vector instructions (-march=native), and cost more than the C library without them.
+A source compiled with -DDLN_OWN_ELEMENTARY uses these functions; otherwise it calls <math.h>. They are faster with
+vector instructions (-march=native), and slower than the C library without.
 
 Each is accurate to two units in the last place over its range and has the usual values at zeros, infinities and NaN;
 only `exp` flushes results below the smallest normal number to zero. The methods are standard (Cody and Waite, Software
@@ -23,7 +23,7 @@ from dln_jax.export.c.text import fill
 OPERATIONS = {"exp": 32, "expm1": 39, "tanh": 51, "sin": 43, "cos": 43, "log": 31, "log1p": 36}
 """Floating-point operations of one evaluation; a multiply-add counts 2, comparisons 0 (float needs fewer)."""
 VECTORISED = tuple(OPERATIONS)
-"""Names of the functions that vectorise."""
+"""Names of the vectorising functions."""
 
 # The polynomials are interpolated at Chebyshev nodes in 60 digits (mpmath), then rounded, and evaluated by Estrin's
 # scheme, whose halves are independent. In r or in z = r²:
@@ -326,14 +326,14 @@ _BOTH_OF_LIBRARY = """static inline void elementary_sin_cos(real x, real *sine_o
 
 
 def definitions(names: Iterable[str], precision: str, *, arrays: Iterable[str] = ()) -> str:
-    """Returns the C of `elementary_NAME(x)` for names, of `elementary_NAME_each(n, x, y)` for arrays, and of helpers.
+    """Returns the C text of `elementary_NAME(x)`, of `elementary_NAME_each(n, x, y)` for arrays, and of helpers.
 
-    Special names: `choice` selects one of two numbers, which the others need too; `rounded` rounds to fewer bits;
-    `ordered` compares in the total order; `sin_cos` computes both functions in the time of one.
+    Special names: `choice` selects one of two numbers (the others use it); `rounded` rounds to fewer bits; `ordered`
+    compares in the total order; `sin_cos` computes both functions in the time of one.
 
-    The source must first include <float.h>, <math.h> and <stdint.h> and define the type `real` and
-    `MULTIPLY_ADD(a, b, c)`, which is a b + c, fused or not. Arrays have functions of their own because gcc vectorises
-    the loop around a call only if it inlines the call, and it inlines about sixty calls per source.
+    The source must first include <float.h>, <math.h> and <stdint.h> and define the type `real` and `MULTIPLY_ADD(a, b,
+    c)`, which is a b + c, fused or not. Arrays have separate functions: gcc vectorises the loop around a call only if
+    it inlines the call, and it inlines about sixty calls per source.
     """
     arrays = set(arrays)
     needed = arrays.union(names)

@@ -1,4 +1,4 @@
-"""C of elementwise operations, small products, short sums and copies: unrolled, or in loops over arrays."""
+"""C text of elementwise operations, small products, short sums and copies, unrolled or in loops over arrays."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -16,14 +16,14 @@ _CHOICES = {
     "max": "elementary_choice(({0} > {1}) | ({0} != {0}), {0}, {1})",
     "min": "elementary_choice(({0} < {1}) | ({0} != {0}), {0}, {1})",
 }
-"""Branch-free C for loops, because a branch would prevent vectorisation."""
+"""Branch-free C for loops: a branch would prevent vectorisation."""
 _FIRST = np.array(0)
 _BOXES = 6
-"""Largest number of boxes that become separate loops; more are read through tables of positions."""
+"""Largest number of boxes with separate loops; more boxes use tables of positions."""
 
 
 def unrolled(body: Body, node: Node) -> None:
-    """Writes a scalar as an expression of variables and of the scalars fused into it, or a sine with its cosine."""
+    """Writes a scalar as an expression of variables and fused scalars, or a sine with its cosine."""
     if node in body.plan.beside:
         pair = sorted((node, body.plan.beside[node]), key=lambda scalar: scalar.op, reverse=True)
         body.spend(sin=1)
@@ -40,7 +40,7 @@ def unrolled(body: Body, node: Node) -> None:
 
 
 def _scalar(body: Body, node: Node, root: Node) -> str:
-    """Returns the C expression of a scalar, including the scalars fused into the same root."""
+    """Returns the C expression of a scalar with its fused scalars."""
     if node is not root and body.plan.root.get(node) is not root:
         return body.read(node, _FIRST)
     if node.op == "take":
@@ -61,7 +61,7 @@ def _expression(body: Body, node: Node, args: list[str], *, looped: bool = False
         return f"elementary_{node.op}({args[0]})"
     if looped and node.dtype == "real" and node.op in _CHOICES:
         return _CHOICES[node.op].format(*args)
-    # The kind of the operands decides; the result of a comparison is bool.
+    # The operands decide the kind; a comparison gives bool.
     return expression(node.op, node.args[-1].dtype, *args, suffix=body.source.suffix)
 
 
@@ -122,9 +122,9 @@ def _merged(shape: Sequence[int], steps: list[list[int | None]]) -> list[int]:
 
 
 def copied(body: Body, node: Node, target: str, *, own: bool = False) -> None:
-    """Copies a node to an array; `own` means the array that is to hold a gather.
+    """Copies a node to an array; `own` marks the array of a gather.
 
-    Large gathers are split into boxes, each read from one source by one loop nest.
+    Large gathers are split into boxes; one loop nest reads each box from one source.
     """
     if not node.size:
         return
@@ -143,7 +143,7 @@ def copied(body: Body, node: Node, target: str, *, own: bool = False) -> None:
 
 
 def _moved(body: Body, node: Node, positions: np.ndarray, own: bool, names: Sequence[str] = ()) -> str:
-    """Returns the C expression of elements; with `own`, of the sources of a gather that an array will hold."""
+    """Returns the C expression of elements; with `own`, of the sources of a gather."""
     if not own or node.op != "gather":
         return body.read(node, positions, names)
     source, positions = read_source(node, positions)
@@ -151,7 +151,7 @@ def _moved(body: Body, node: Node, positions: np.ndarray, own: bool, names: Sequ
 
 
 def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:
-    """Splits the elements into boxes that one loop nest can read from one source."""
+    """Splits the elements into boxes, each for one loop nest and one source."""
     if node.op != "gather" or node.value is None:
         return [index]
     owner = owners(node.args, node.value)[0].ravel()
@@ -175,7 +175,7 @@ def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:
 
 
 def _by_source(node: Node, index: np.ndarray) -> list[np.ndarray]:
-    """Returns the elements of every source, as [axes along which the source is constant, the rest as one axis]."""
+    """Returns the elements of every source as [axes with a constant source, other axes merged]."""
     owner, _ = owners(node.args, np.asarray(node.value))
     leading = []
     while len(leading) < index.ndim - 1 and (owner == owner[:1]).all():
@@ -186,7 +186,7 @@ def _by_source(node: Node, index: np.ndarray) -> list[np.ndarray]:
 
 
 def _runs(at: np.ndarray, owner: np.ndarray) -> list[int]:
-    """Returns the starts, and the end, of the runs of rows with equal sources and equal steps."""
+    """Returns the starts and the end of runs of rows with equal sources and equal steps."""
     steps, cuts = np.diff(at, axis=0), [0]
     for row in range(1, len(at)):
         first = cuts[-1]

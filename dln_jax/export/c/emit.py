@@ -24,17 +24,17 @@ def body_of(
 
     Args:
         source: tables and helper functions of the file.
-        inputs: name of every argument, and whether it is passed by value.
+        inputs: name of every argument, and a flag for passing by value.
         targets: names of the arrays for the results.
-        apart: whether results never overlap arguments.
-        optional: whether a target may be a null pointer.
+        apart: results never overlap arguments.
+        optional: a target may be a null pointer.
     """
     body = Body(source, program, plan_of(program, results), inputs)
     region(body, ())
     if results and not targets:
         body.line(f"return {body.read(results[0], np.array(0))};")
-    # Targets that may overlap arguments must not be written before all arguments are read. Results that only move
-    # elements of arguments are therefore copied to arrays first.
+    # All arguments must be read before writing to targets that may overlap them. So results that only move elements of
+    # arguments are copied to arrays first.
     moved = {k for k, _ in enumerate(targets) if not apart and results[k].size and _is_moved(body, results[k])}
     for k in sorted(moved):
         body.declared(f"r{k}_", results[k].dtype, results[k].size)
@@ -61,7 +61,7 @@ def _from_array(body: Body, source: str, size: int, target: str) -> None:
 
 
 def region(body: Body, region: Region, only: Collection[Node] | None = None) -> None:
-    """Writes the nodes of a region that are not written yet; `only` restricts them to a set."""
+    """Writes the remaining nodes of a region; `only` restricts them to a set."""
     nodes = [node for node in body.plan.order.get(region, []) if only is None or node in only]
     for node in nodes:
         if node not in body.done:
@@ -70,7 +70,7 @@ def region(body: Body, region: Region, only: Collection[Node] | None = None) -> 
 
 
 def _computed(body: Body, node: Node, among: list[Node]) -> None:
-    """Writes a node, and those among its region that the same C computes."""
+    """Writes a node, and other nodes of its region from the same C text."""
     plan = body.plan
     body.done.add(node)
     if node.op == "gather":
@@ -124,7 +124,7 @@ def _part(source: Source, program: Program, results: list[Node]) -> Called:
 def _stored(body: Body, node: Node, results: Sequence[Node], turns: int = 1) -> list[str]:
     """Declares arrays for the results of a loop or branch, read or not, and returns their names.
 
-    A loop has its carries, initialised with its arguments, then the outputs of all `turns` iterations.
+    A loop has arrays for its carries, initialised with its arguments, then for the outputs of all `turns` iterations.
     """
     number = np.ravel(node.attribute)[0]
     starts = () if node.op == "branch" else node.args
@@ -140,7 +140,7 @@ def _stored(body: Body, node: Node, results: Sequence[Node], turns: int = 1) -> 
 
 
 def _carry_over(body: Body, loop: Loop, names: list[str], number: int) -> None:
-    """Writes the new carries, through temporaries: they may be the old carries in another order."""
+    """Writes the new carries through temporaries, because they may permute the old carries."""
     moved = [
         (name, f"n{number}_{index}", node)
         for index, (name, node) in enumerate(zip(names, loop.results, strict=False))
@@ -178,7 +178,7 @@ def _while(body: Body, node: Node) -> None:
 
 
 def _bound(node: Node, loop: Loop) -> int | None:
-    """Returns the largest number of iterations of a `while` whose condition compares a counter, or None."""
+    """Returns the largest number of iterations of a `while` with a counter in its condition, or None."""
     waiting, bounds = [*loop.conditions], []
     for test in waiting:
         if test.op == "and" and test.dtype == "bool":

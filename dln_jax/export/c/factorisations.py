@@ -1,4 +1,4 @@
-"""C of factorisations of small dense matrices, and of triangular solves."""
+"""C text of factorisations of small dense matrices, and of triangular solves."""
 
 from collections.abc import Collection
 from string import Template
@@ -184,7 +184,7 @@ FUNCTIONS = {
     }
     """,
 }
-"""C functions by the name of their node; a source contains those that it calls."""
+"""C functions by the name of their node; a source contains only the called functions."""
 
 
 def definitions(names: Collection[str], suffix: str) -> str:
@@ -211,7 +211,7 @@ _COSTS = {
         for name, count in {"mul": 8 * n + 4, "add": 4 * n + 9, "div": 5, "sqrt": 2}.items()
     },
 }  # fmt: skip
-"""Upper bound on the operations of a C function, by the sizes that it takes."""
+"""Upper bound on the operations of a C function, from its sizes."""
 
 
 def _call(body: Body, node: Node) -> None:

@@ -1,4 +1,4 @@
-"""Rules for gather, scatter, dynamic slices and sort by flat positions, constant where the indices are."""
+"""Rules for gather, scatter, dynamic slices and sort by flat positions (constant for constant indices)."""
 
 from collections.abc import Sequence
 from math import prod
@@ -18,7 +18,7 @@ _COMBINED = ("add", "sub", "mul", "min", "max")
 def _gather(
     program: Program, operand: Node, indices: Node, *, dimension_numbers: Any, slice_sizes, mode: Any, fill_value: Any
 ) -> Node:
-    """Applies `lax.gather`; windows that reach outside the operand are moved inside or filled."""
+    """Applies `lax.gather`; windows that extend outside the operand are moved inside or filled."""
     numbers = dimension_numbers
     rank = len(indices.shape) - 1 + len(numbers.offset_dims)
     outer = [axis for axis in range(rank) if axis not in numbers.offset_dims]
@@ -66,16 +66,17 @@ def _scatter(op: str) -> Rule:
 def _windows(
     program: Program, indices: Node, shape, sizes, mode: Any, axes, *, dropped=(), batched=((), ())
 ) -> tuple[Node, Node]:
-    """Returns the flat positions of windows, clamped into the operand, and which to keep if those outside are dropped.
+    """Returns the flat positions of windows, clamped into the operand, and a mask of windows to keep if others are
+    dropped.
 
     Args:
-        program: program in which they are computed.
+        program: program for the computation.
         indices: corners of the windows [batch, axes].
         shape: shape of the operand.
         sizes: size of a window along each axis of the operand.
         mode: mode of `lax.gather` or `lax.scatter`, for windows outside.
-        axes: axes of the operand that the indices refer to.
-        dropped: axes of the operand that a window lacks.
+        axes: indexed axes of the operand.
+        dropped: axes of the operand without a window axis.
         batched: corresponding axes of the operand and of the indices.
     """
     batch, fills = indices.shape[:-1], "FILL" in str(mode).upper()
@@ -112,7 +113,7 @@ def take(program: Program, operand: Node, positions: Node) -> Node:
 
 
 def _put(program: Program, op: str, operand: Node, targets: Node, updates: Node) -> Node:
-    """Returns the operand with updates set at, or combined with, flat targets; negative targets are dropped."""
+    """Returns the operand with updates at flat targets, set or combined; negative targets are dropped."""
     if not is_constant(targets):
         return program.make(f"put_{op}", operand.shape, operand.dtype, [operand, targets, updates])
     flat = values(targets).ravel()
@@ -131,7 +132,7 @@ def _put(program: Program, op: str, operand: Node, targets: Node, updates: Node)
 
 
 def _updated(program: Program, closed: Any, operand: Node, targets: Node, updates: Node) -> Node:
-    """Returns the operand after a jaxpr of an element and an update, at one target after the other."""
+    """Returns the operand after applying a jaxpr of element and update at each target in turn."""
     for target, update in zip(program.scalars(targets), program.scalars(updates), strict=True):
         old = take(program, operand, program.elementwise("max", target, 0))
         (new,) = program.inline(program, closed, [old, update])

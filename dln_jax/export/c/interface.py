@@ -33,12 +33,12 @@ class Leaf(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """Upper bounds on what one call of a C function takes."""
+    """Upper bounds on the cost of one call of a C function."""
 
     operations: int = 0
     """Floating-point operations, including those of the source's own elementary functions."""
     additions: int = 0
-    """Additions and subtractions outside elementary functions; a multiply-add counts here and as a multiplication."""
+    """Additions and subtractions outside elementary functions; a multiply-add also counts as a multiplication."""
     multiplications: int = 0
     divisions: int = 0
     square_roots: int = 0
@@ -59,20 +59,20 @@ class Signature(NamedTuple):
 
     @property
     def returns(self) -> bool:
-        """Whether the function returns its only result, a scalar, instead of writing to an array."""
+        """True if the function returns its only result, a scalar, instead of writing to an array."""
         return [leaf.shape for leaf in self.results] == [()]
 
     @property
     def written(self) -> tuple[Leaf, ...]:
-        """Results that the function writes to arrays."""
+        """Results in arrays."""
         return () if self.returns else self.results
 
 
 def signature_of(function: Function, examples: Sequence[Any], shapes: Any) -> Signature:
     """Returns the signature of a function, without costs, from example arguments and the shapes of its results.
 
-    Arguments are named after the function's parameters, results after their keys, or `result` if there are none. Leaves
-    of a tree have the path of the leaf too.
+    Arguments are named after the function's parameters, results after their keys (`result` without keys). Leaves of a
+    tree also have the path of the leaf.
     """
     try:
         names = list(inspect.signature(function).parameters)
@@ -115,7 +115,7 @@ def description(
     name: str, precision: str, version: str, functions: Mapping[str, Signature], header: bytes, source: bytes
 ) -> bytes:
     """Returns the JSON description of an export: its functions, and a digest of itself, the header and the source."""
-    # JSON turns leaves and shapes, which are tuples, into lists.
+    # JSON converts the tuples of leaves and shapes to lists.
     stated = {
         key: {"arguments": function.arguments, "results": function.results, **function.cost._asdict()}
         for key, function in functions.items()
@@ -140,7 +140,7 @@ def stated_costs(directory: str | Path, *, name: str = "model") -> dict[str, Cos
 def read_interface(directory: Path, name: str) -> tuple[str, dict[str, Signature], dict[str, bytes]]:
     """Returns the precision and the signatures of an export, and its header and source, checked by their digest.
 
-    The digest detects accidents, such as an interrupted export or an edited file, and no forgery.
+    The digest detects accidents, such as an interrupted export or an edited file, but no forgery.
 
     Raises:
         InputError: a file is missing or altered, or the format differs.
@@ -156,7 +156,9 @@ def read_interface(directory: Path, name: str) -> tuple[str, dict[str, Signature
     except OSError as error:
         raise InputError(f"{error.filename}: cannot be read ({error.strerror}); export it again") from error
     if stated.pop("digest", None) != _digest(stated, *files.values()) or stated["name"] != name:
-        raise InputError(f"{path}: it, {name}.h or {name}.c is altered, renamed or of another export; export it again")
+        raise InputError(
+            f"{path}: it, {name}.h or {name}.c is altered, renamed or from another export; export it again"
+        )
     signatures = {}
     for key, values in stated["functions"].items():
         arguments, results = (

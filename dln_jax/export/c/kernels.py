@@ -1,4 +1,4 @@
-"""C of products, reductions, scattered updates and sorts; functions on matrices are in `factorisations`."""
+"""C text of products, reductions, scattered updates and sorts; see `factorisations` for functions of matrices."""
 
 from collections.abc import Callable, Collection
 from string import Template
@@ -47,7 +47,7 @@ static void elementary_order_$kind(int rows, int n, const $c *key, long long *me
 
 
 def orderings(names: Collection[str]) -> str:
-    """Returns the C functions with these names, which sort by keys of a kind."""
+    """Returns the C functions with these names for sorting by keys of a kind."""
     return "".join(_ORDER.substitute(kind=kind, c=c) for kind, c in C_TYPES.items() if f"order_{kind}" in names)
 
 
@@ -55,8 +55,8 @@ def dot_general(body: Body, members: list[Node]) -> None:
     """Writes the products of several matrices with the same second matrix.
 
     Every loop keeps a block of sums in registers, side by side along the contiguous axis of the second matrix. Products
-    with the same constant share one loop, so that a value and its tangents pass through a network layer together, and
-    the constant is stored in the order of that loop. A product with one column splits its sums into parts.
+    with the same constant share one loop, so a value and its tangents pass through a network layer together. The
+    constant is stored in the order of the loop. A product with one column splits its sums into parts.
     """
     for node in members:
         body.kept(node)
@@ -81,7 +81,7 @@ def dot_general(body: Body, members: list[Node]) -> None:
 
 
 def _parts(rows: int, columns: int, count: int) -> int:
-    """Returns the number of partial sums per column: with few columns, several hide the latency of an addition."""
+    """Returns the number of partial sums per column: with few columns, several sums hide the latency of additions."""
     parts = {1: 4 if columns <= 32 else 1, 2: 2 if columns <= 16 else 1}.get(rows, 1)
     while count % parts:
         parts //= 2
@@ -89,7 +89,7 @@ def _parts(rows: int, columns: int, count: int) -> int:
 
 
 def _block(body: Body, rows: list[tuple[Node, np.ndarray]]) -> None:
-    """Writes rows of products with one matrix, of which each is one row, or all in loops over a batch and its rows."""
+    """Writes rows of products with one matrix: single rows, or loops over a batch and its rows."""
     factor, kind = rows[0][0].args[1], rows[0][0].dtype
     batch, count, columns = factor.shape
     body.spend(multiply_add=len(rows) * count * columns * (kind == "real"))
@@ -152,7 +152,7 @@ def _dots(body: Body, node: Node) -> None:
 
 
 def summed(body: Body, count: int, parts: int, add: Callable[[str, str], str]) -> None:
-    """Declares a real `sum_` of `count` terms, computed in partial sums that vectorise.
+    """Declares a real `sum_` of `count` terms, computed in vectorisable partial sums.
 
     `add(k, total)` returns the C of the total and term k; `parts` is a power of 2.
     """

@@ -1,9 +1,9 @@
 """Loads exported C as Python functions: compiles it with a local C compiler, together with a generated binding.
 
-The binding is C that calls the exported functions from Python. It declares the few functions of Python (3.11 and later)
-that it calls, so no headers are needed. A call of a two-link arm's inverse dynamics takes 0.5 us; with ctypes it takes
-8.5 us for arrays, and 1.1 us through buffers bound beforehand, which serve one caller at a time (the fastest of 81
-turns of 5,000 calls on two shared cores).
+The binding is C code that calls the exported functions from Python. It declares the few Python functions (3.11 and
+later) that it needs, so it needs no headers. The inverse dynamics of a two-link arm takes 0.5 us per call. With ctypes
+it takes 8.5 us for arrays, or 1.1 us with prebound buffers for a single caller (the fastest of 81 turns of 5,000 calls
+on two shared cores).
 """
 
 import collections
@@ -28,9 +28,9 @@ from dln_jax.mechanics.arguments import require_shape
 from dln_jax.types import InputError
 
 FLAGS = ("-O3", "-march=native", "-DDLN_OWN_ELEMENTARY")
-"""Optimises for the compiling processor, with vectorised elementary functions, without reordering sums."""
+"""Optimises for this processor, with vectorised elementary functions and without reordering sums."""
 STANDARD = ("-std=c99", "-pedantic")
-# On macOS the linker must be told that Python's symbols resolve when the library is loaded.
+# On macOS the linker needs an option to resolve Python's symbols at load time.
 _UNDEFINED = ("-undefined", "dynamic_lookup") if sys.platform == "darwin" else ()
 
 
@@ -39,26 +39,33 @@ def load_c(
 ) -> Any:
     """Compiles an export in a temporary folder and returns a named tuple of its functions.
 
-    The functions take NumPy arrays (or lists of numbers) by position, raise `InputError` for shapes that differ from
-    the exported ones, and return their result, or a named tuple of several. Contiguous arrays of the exported type are
-    fastest; other arguments are converted first.
+    The functions take NumPy arrays (or lists of numbers) by position. They return their result, or a named tuple of
+    several results, and raise `InputError` for other shapes than the exported ones. Contiguous arrays of the exported
+    type are fastest; other arguments are converted first.
 
     The C code is compiled and run, so load only folders that you trust. The digest in the description detects altered
-    or mixed-up files; it does not prove who wrote them.
+    or mixed-up files, but does not prove their origin.
 
     Args:
-        directory: folder with the files that `export_c` wrote.
+        directory: folder with the files of `export_c`.
         compiler: C compiler; default: the first of $CC, cc, gcc and clang that exists.
         flags: additional compiler flags.
 
     Raises:
-        InputError: files are missing, altered or of another format, there is no compiler, or it fails.
+        InputError: files are missing, altered or of another format, or there is no working compiler.
+
+    Example:
+        >>> import numpy as np
+        >>> import dln_jax
+        >>> paths = dln_jax.export_c({"square": (lambda x: x**2, (np.ones(3),))}, "square-c")
+        >>> dln_jax.load_c("square-c").square([1.0, 2.0, 3.0])
+        array([1., 4., 9.])
     """
     precision, signatures, sources = read_interface(Path(directory), check_name(name))
     types = {**NUMPY_TYPES, "bool": np.int32, "real": PRECISIONS[precision][0]}
     try:
         with tempfile.TemporaryDirectory() as folder:
-            # The checked bytes are compiled, even if the folder changes meanwhile.
+            # Compiles the checked bytes, even if the folder changes meanwhile.
             files = {f"{folder}/{file_name}": content for file_name, content in sources.items()}
             # No file of an export has a hyphen in its name.
             files[f"{folder}/for-python.c"] = _binding(name, signatures, PRECISIONS[precision][1], types).encode()
@@ -67,10 +74,10 @@ def load_c(
             texts = [path for path in files if path.endswith(".c")]
             built = f"{folder}/lib{name}.so"
             compile_c([*STANDARD, *flags, "-fPIC", "-shared", *_UNDEFINED, *texts, "-lm", "-o", built], compiler)
-            # PyDLL keeps the interpreter's lock: releasing it takes longer than the functions, some microseconds.
+            # PyDLL keeps the interpreter's lock: releasing it would take some microseconds, longer than the functions.
             make = ctypes.PyDLL(built)[f"{name}_python"]
     except OSError as error:
-        raise InputError(f"{directory}: not to be built in a temporary folder ({error}); set TMPDIR") from error
+        raise InputError(f"{directory}: cannot be built in a temporary folder ({error}); set TMPDIR") from error
     make.argtypes, make.restype = (ctypes.c_int, ctypes.py_object), ctypes.py_object
     made: dict[str, Function] = {}
     for number, (key, signature) in enumerate(signatures.items()):
@@ -89,7 +96,7 @@ def compile_c(arguments: Sequence[str], compiler: str | None = None) -> None:
     result = subprocess.run([chosen, *arguments], capture_output=True, text=True, errors="replace")
     if result.returncode:
         complaint = next((line for line in result.stderr.splitlines() if "error" in line), result.stderr.strip())
-        raise InputError(f"{chosen} could not compile the model: {complaint}; export it again, or name other flags")
+        raise InputError(f"{chosen} could not compile the model: {complaint}; export it again, or pass other flags")
 
 
 def _call_converted(
@@ -256,7 +263,7 @@ static PyObject *call_$number(PyObject *self, PyObject *const *arguments, Py_ssi
 
 
 def _binding(name: str, signatures: Mapping[str, Signature], real: str, types: Mapping[str, Any]) -> str:
-    """Returns the source of the binding, which is compiled together with the export."""
+    """Returns the source of the binding, to compile with the export."""
     functions = methods = ""
     maximum = 1
     for number, (key, signature) in enumerate(signatures.items()):

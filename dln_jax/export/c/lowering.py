@@ -19,7 +19,7 @@ from dln_jax.export.c.text import PRECISIONS, failure, kind_of
 from dln_jax.types import InputError
 
 _LARGE_CALL = 600
-"""A jitted function with at least this many equations that is called several times becomes a C function."""
+"""Smallest number of equations for which a repeatedly called jitted function becomes a C function."""
 _CALLS = {
     "jit": "jaxpr", "closed_call": "call_jaxpr", "remat2": "jaxpr", "eval_jaxpr": "call_jaxpr",
     "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "custom_vmap_call": "call",
@@ -30,7 +30,7 @@ _WITHOUT_EFFECT = frozenset((
     "indices_are_sorted", "unique_indices", "is_stable", "sort_eigenvalues", "conjugate_a", "branches_platforms",
     "ft_in", "ft_out", "memory_space", "devices", "srcs", "copy_semantics", "num_consts", "num_carry",
 ))  # fmt: skip
-"""Parameters that no value depends on: hints, promises, and types that the results have anyway."""
+"""Parameters without effect on values: hints, promises, and types that the results already have."""
 _REFUSED = {
     "random": "random numbers; draw them beforehand and pass them as arguments",
     "threefry": "random numbers; draw them beforehand and pass them as arguments",
@@ -43,25 +43,27 @@ def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, 
     """Returns the closed jaxpr of a function, and the tree of its results.
 
     Raises:
-        InputError: the function has side effects, integers beyond 64 bits, or branches of Python on an argument.
+        InputError: the function has side effects, integers beyond 64 bits, or Python branches on an argument.
     """
     try:
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
     except jax.errors.ConcretizationTypeError as error:
         raise InputError(
-            "the function needs the value of an argument in Python, such as for `if x > 0`; write jnp.where or lax.cond"
+            "the function uses the value of an argument in Python, such as `if x > 0`; use jnp.where or lax.cond"
         ) from error
     except OverflowError as error:
         raise InputError(f"a whole number is out of range ({error}); C has integers of up to 64 bits") from error
     if closed.effects:
-        raise InputError(f"the function has side effects ({', '.join(map(str, closed.effects))}); C export takes none")
+        raise InputError(
+            f"the function has side effects ({', '.join(map(str, closed.effects))}); C export does not support them"
+        )
     return closed, shapes
 
 
 def repeated_calls(every: Sequence[Any]) -> set[int]:
-    """Returns the `id` values of large jaxprs that these closed jaxprs call several times.
+    """Returns the `id` values of large jaxprs with several calls in these closed jaxprs.
 
-    Calls of one jitted function with arguments of equal types share a jaxpr, which JAX keeps.
+    Calls of one jitted function with equal argument types share a jaxpr, which JAX keeps.
     """
     sizes: dict[int, int] = {}
     counts: Counter[int] = Counter()
@@ -89,14 +91,14 @@ def program_of(
     """Returns the program of a closed jaxpr, its inputs and its results.
 
     Args:
-        closed: the jaxpr, as `traced` returns it.
-        repeated: `id` values of jaxprs whose calls stay calls in the program, from `repeated_calls`.
+        closed: the jaxpr from `traced`.
+        repeated: `id` values, from `repeated_calls`, of jaxprs that remain calls in the program.
         precision: f32 or f64.
         finite: arguments and intermediate results are finite numbers.
 
     Raises:
-        InputError: the jaxpr cannot be written in C: it has an unsupported primitive (the message names the line that
-            made it), random numbers, an unsupported dtype, or a shape unknown at compile time.
+        InputError: the jaxpr cannot be written in C. It has an unsupported primitive (the message names its line),
+            random numbers, an unsupported dtype, or a shape unknown at compile time.
     """
     program = Program(real=PRECISIONS[precision][0], repeated=repeated, finite=finite, inline=_inline)
     inputs = [
@@ -141,7 +143,7 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
     name = primitive.name
     for variable in equation.outvars:
         if not all(isinstance(size, int | np.integer) for size in getattr(variable.aval, "shape", ())):
-            raise InputError(f"an array has shape {variable.aval.shape}; expected sizes that are known beforehand")
+            raise InputError(f"an array has shape {variable.aval.shape}; expected fixed sizes")
     if name in _CALLS:
         inner = parameters[_CALLS[name]]
         if id(inner) in program.repeated:
@@ -165,7 +167,7 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
     if why := next((reason for part, reason in _REFUSED.items() if part in name), None):
         raise InputError(f"'{name}' is {why}")
     if _of_jax(primitive):
-        raise InputError(f"the primitive '{name}' has no C")
+        raise InputError(f"the primitive '{name}' is not supported in C")
 
     def run(*unknown: Any) -> list[Any]:
         left = iter(unknown)
@@ -173,19 +175,19 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
             primitive.impl(*(next(left) if fixed is None else fixed for fixed in known), **parameters)
         )
 
-    # Another library's primitive, such as Equinox's, may need the values of constant arguments.
+    # Primitives of other libraries, such as Equinox, may need the values of constant arguments.
     known = [values(arg) if is_constant(arg) else None for arg in args]
     return primitives.composed(program, run, [arg for arg in args if not is_constant(arg)])
 
 
 def _ruled(program: Program, equation: Any, args: list[Node]) -> list[Node]:
-    """Returns the results by the primitive's rule; refuses parameters that the rule does not read."""
+    """Returns the results by the primitive's rule; refuses unknown parameters."""
     name, results = equation.primitive.name, [variable.aval for variable in equation.outvars]
     rule = _RULES.get(name) or (lambda program, *args: program.elementwise(name, *args))
     read = inspect.signature(rule).parameters
     for key, value in equation.params.items():
         if key not in read and key not in _WITHOUT_EFFECT and value is not None and value is not False:
-            raise InputError(f"the primitive '{name}' has no C with {key}={value}".partition("\n")[0])
+            raise InputError(f"the primitive '{name}' is not supported in C with {key}={value}".partition("\n")[0])
     if results and all(0 in aval.shape for aval in results):
         return [program.constant(np.zeros(aval.shape), kind_of(aval.dtype)) for aval in results]
     known = {**equation.params, "results": results, "kind": kind_of(results[0].dtype) if results else None}
@@ -224,7 +226,7 @@ def _of_jax(primitive: Any) -> bool:
 
 
 def _is_error_of_equinox(equation: Any) -> bool:
-    """Returns whether an equation is the callback that raises the error of `equinox.error_if`."""
+    """Returns whether an equation is the error callback of `equinox.error_if`."""
     if equation.primitive.name != "pure_callback":
         return False
     callback = equation.params["callback"]
@@ -237,7 +239,7 @@ def _closed(jaxpr: Any) -> Any:
 
 
 def _made_at(equation: Any) -> str:
-    """Returns " (made at FILE:LINE)" for the user's code that made an equation, or "" if JAX kept no traceback."""
+    """Returns " (made at FILE:LINE)" with the line of user code, or "" if JAX kept no traceback."""
     traceback = equation.source_info.traceback
     frames = [] if traceback is None else list(traceback.frames)
     users = [frame for frame in frames if "/jax/" not in frame.file_name and "/dln_jax/export/" not in frame.file_name]

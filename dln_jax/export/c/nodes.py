@@ -1,4 +1,4 @@
-"""Nodes of a program of small arrays, the values of constant ones, and which are written element by element."""
+"""Nodes of a program of small arrays, the values of constant nodes, and the choice of unrolled nodes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,26 +10,26 @@ import numpy as np
 from dln_jax.export.c.operations import TRANSCENDENTAL
 
 UNROLL_LIMIT = 64
-"""Largest number of elements of a result, or of products in a sum, that are unrolled; structural zeros are free."""
+"""Largest number of unrolled elements of a result, or of products in a sum; structural zeros do not count."""
 VECTOR = 8
 VECTOR_OF_FUNCTIONS = 4
 """Results with fewer elements are always unrolled; the second limit is for functions of <math.h>."""
 _MOST_ZEROS = 16 * UNROLL_LIMIT
-"""Largest number of elements, including structural zeros, of a result that is unrolled."""
+"""Largest number of elements, including structural zeros, of an unrolled result."""
 _MOST_SCALARS = 36
-"""Largest number of elements of an operation on scalars alone that is unrolled; larger ones are faster as loops."""
+"""Largest number of elements of an unrolled operation on scalars; larger operations are faster as loops."""
 _TRIVIAL = {
     "mul": np.logical_or, "add": np.logical_or, "sub": np.logical_or, "div": lambda a, b: a, "neg": lambda a: a,
     "select": lambda condition, a, b: a & b,
 }  # fmt: skip
-"""Where an operation on finite numbers costs nothing, given where its arguments are zero."""
+"""Masks of zero arguments -> mask of elements at no cost, for an operation on finite numbers."""
 Region = tuple[int, ...]
 """Numbers of the loops and branches around a node, outermost first."""
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """An array that a program computes; equal nodes are one object."""
+    """An array computed by a program; equal nodes are one object."""
 
     op: str
     shape: tuple[int, ...]
@@ -43,7 +43,7 @@ class Node:
     number: int
 
     def __hash__(self) -> int:
-        """Returns the number: with addresses, the order of sets, and so the text, would vary between processes."""
+        """Returns the number. Addresses would change the order of sets, and so the text, between processes."""
         return self.number
 
     @property
@@ -77,7 +77,7 @@ def values(node: Node) -> np.ndarray:
 
 
 def is_all(node: Node, number: Any) -> bool:
-    """Returns whether all elements are known to equal a number."""
+    """Returns whether all elements are known to be this number."""
     return is_constant(node) and bool((values(node) == number).all())
 
 
@@ -88,7 +88,7 @@ def is_uniform(node: Node) -> bool:
 
 
 def known(node: Node) -> tuple[np.ndarray, np.ndarray]:
-    """Returns which elements [size] are constant, and their values (zero for the others)."""
+    """Returns the mask [size] of constant elements, and their values (zero for the others)."""
     if node.op == "const":
         return np.ones(node.size, bool), np.asarray(node.value).ravel()
     if node.op == "gather":
@@ -99,7 +99,7 @@ def known(node: Node) -> tuple[np.ndarray, np.ndarray]:
 
 
 def zeros(node: Node) -> np.ndarray:
-    """Returns which elements [size] are known to be zero."""
+    """Returns the mask [size] of known zeros."""
     mask, numbers = known(node)
     return mask & (numbers == 0)
 
@@ -110,24 +110,24 @@ def is_direct(node: Node) -> bool:
 
 
 def steps(positions: np.ndarray) -> list[int | None]:
-    """Returns the step of the positions along each axis, or None where it is not the same everywhere."""
+    """Returns the step of the positions along each axis, or None for varying steps."""
     every = [np.diff(positions, axis=axis) for axis in range(positions.ndim)]
     return [0 if not step.size else None if np.ptp(step) else int(step.flat[0]) for step in every]
 
 
 def owners(sources: Sequence[Node], positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the index of the source at every position in the sources laid end to end, and their first positions."""
+    """Returns the source index of every position in the concatenated sources, and the first position of each source."""
     starts = np.cumsum([0, *(source.size for source in sources)])
     return np.searchsorted(starts, positions, side="right") - 1, starts
 
 
 def sources_of(node: Node) -> tuple[Sequence[Node], np.ndarray]:
-    """Returns the nodes that a node takes its elements from, laid end to end, and the elements' positions [size]."""
+    """Returns the concatenated source nodes of a node, and the positions [size] of its elements in them."""
     return (node.args, np.ravel(node.value)) if node.op == "gather" else ((node,), np.arange(node.size))
 
 
 def read_source(node: Node, positions: np.ndarray) -> tuple[Node, np.ndarray]:
-    """Returns the single source that a `gather` reads at these positions, and the positions in it."""
+    """Returns the single source of a `gather` at these positions, and the positions in it."""
     positions = np.asarray(np.asarray(node.value).ravel()[positions])
     owner, starts = owners(node.args, positions)
     first = int(owner.flat[0])
@@ -136,7 +136,7 @@ def read_source(node: Node, positions: np.ndarray) -> tuple[Node, np.ndarray]:
 
 
 def without_unused(sources: list[Node], positions: np.ndarray) -> tuple[list[Node], np.ndarray]:
-    """Returns the distinct sources that are read, and the positions in them."""
+    """Returns the distinct sources in use, and the positions in them."""
     owner, starts = owners(sources, positions)
     kept, start, moved = {}, 0, np.zeros(len(sources), np.int64)
     for index in np.unique(owner):
@@ -151,7 +151,7 @@ def without_unused(sources: list[Node], positions: np.ndarray) -> tuple[list[Nod
 def unrolls(op: str, args: tuple[Node, ...], shape: tuple[int, ...], *, finite: bool) -> bool:
     """Returns whether an elementwise operation is written element by element.
 
-    Small ones are, so that moving their elements costs nothing and a compiler keeps them in registers.
+    Unrolling small operations makes moving their elements free, and compilers keep them in registers.
     """
     size, functions = prod(shape), op in TRANSCENDENTAL and args[0].dtype == "real"
     if size < (VECTOR_OF_FUNCTIONS if functions else VECTOR):
@@ -168,14 +168,14 @@ def unrolls(op: str, args: tuple[Node, ...], shape: tuple[int, ...], *, finite: 
 
 
 def _is_mixed(gather: Node) -> bool:
-    """Returns whether a gather reads arrays, which a loop cannot read without copying them."""
+    """Returns whether a gather reads arrays that a loop would have to copy."""
     return any(arg.size > 1 or arg.op == "const" for arg in gather.args)
 
 
 def unrolls_product(a: Node, b: Node, *, finite: bool) -> bool:
     """Returns whether a product of matrices [b, m, k] and [b, k, n] is written element by element.
 
-    Constants with several columns stay whole: other products with the same constant share its loop.
+    Constants with several columns are not unrolled, because other products with the same constant share the loop.
     """
     (batch, m, k), n = a.shape, b.shape[2]
     if batch * m * k * n <= UNROLL_LIMIT and not (is_constant(b) and n >= VECTOR_OF_FUNCTIONS):

@@ -24,13 +24,13 @@ class Operation(NamedTuple):
     c: str
     """C expression in the arguments {0}, {1}, ...; {f} is the suffix of functions of <math.h>."""
     fold: Callable[..., Any] | None
-    """The same for NumPy arrays; None leaves constants to C, which defines the values at poles."""
+    """The same for NumPy arrays. None leaves constants to C, which defines the values at poles."""
     cost: int = 1
     """Floating-point operations; comparisons and selections cost 0."""
     dtype: str | None = None
-    """Kind of the result; None for that of the arguments."""
+    """Kind of the result; None for the kind of the arguments."""
     function: str | None = None
-    """Function of <math.h> that it calls, if any."""
+    """Called function of <math.h>, if any."""
     integer: str = ""
     """C expression for integers and booleans of type {c}, with unsigned type {u}, if it differs."""
 
@@ -40,7 +40,7 @@ class Operation(NamedTuple):
         return self.c if as_real else self.integer or self.c
 
     def repeats_arguments(self, kind: str) -> bool:
-        """Returns whether the C contains an argument twice, which must then be a variable."""
+        """Returns whether the C text contains an argument twice; the argument must then be a variable."""
         return any(self.on(kind).count(f"{{{k}}}") > 1 for k in range(3))
 
 
@@ -75,7 +75,7 @@ def _function(name: str, fold: Callable[..., Any] | None, *, arguments: int = 1)
 
 
 def _comparison(symbol: str, fold: Callable[..., Any]) -> Operation:
-    # With a plus, because compilers warn about comparing truths, bits, and numbers with themselves.
+    # The plus avoids compiler warnings about comparing booleans, bits, and numbers with themselves.
     return Operation(f"({{0}} {symbol} {{1}})", fold, 0, "bool", integer=f"(+{{0}} {symbol} +{{1}})")
 
 
@@ -83,7 +83,7 @@ _AS_IN_NUMPY = (
     "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p", "log2", "sin", "cos", "tan", "asin", "acos", "atan", "sinh",
     "cosh", "tanh", "asinh", "acosh", "atanh", "floor", "ceil", "rint", "trunc",
 )  # fmt: skip
-"""Functions of <math.h> that have the same name in NumPy."""
+"""Functions of <math.h> with the same name in NumPy."""
 OPERATIONS = {
     "add": Operation("({0} + {1})", np.add, integer="(({c})(({u}){0} + ({u}){1}))"),
     "sub": Operation("({0} - {1})", np.subtract, integer="(({c})(({u}){0} - ({u}){1}))"),
@@ -133,7 +133,7 @@ OPERATIONS = {
     **{f"{kind}_word_of": _bits(kind) for kind in UNSIGNED},
     "number_of": Operation("elementary_number_of({0})", lambda x: x.view(f"f{x.itemsize}"), 0, "real"),
 }
-"""Operations by name, which is that of JAX's primitive if there is one."""
+"""Operations by name: the name of JAX's primitive if it exists."""
 
 
 def total(operations: Mapping[str, int]) -> int:
@@ -144,9 +144,9 @@ def total(operations: Mapping[str, int]) -> int:
 COMMUTATIVE = frozenset(("add", "mul", "eq", "ne", "and", "or", "xor"))
 """Operations that commute bit for bit, also in floating point."""
 TRANSCENDENTAL = frozenset(name for name, operation in OPERATIONS.items() if operation.function and name != "sqrt")
-"""Operations that call a function of <math.h>, except sqrt."""
+"""Operations with a call of <math.h>, except sqrt."""
 VECTORISED = frozenset(_VECTORISED)
-"""Operations whose C vectorises in loops."""
+"""Operations that vectorise in loops."""
 _NEUTRAL = {"add": 0, "sub": 0, "mul": 1, "div": 1, "or": 0, "xor": 0}
 _ON_BOOL = {"add": "or", "mul": "and", "max": "or", "min": "and", "ne": "xor", "not": "logical_not"}
 
@@ -158,14 +158,14 @@ def on_kind(op: str, kind: str) -> str:
 
 
 def neutral(op: str, kind: str) -> Any:
-    """Returns the number that leaves the other argument of an operation unchanged, or None if there is none."""
+    """Returns the neutral element of an operation, or None without one."""
     if op in ("max", "min"):
         return limit(kind, upper=op == "min")
     return ~NUMPY_TYPES[kind](0) if op == "and" else _NEUTRAL.get(op)
 
 
 def expression(op: str, kind: str, *args: str, suffix: str = "") -> str:
-    """Returns the C of an operation on numbers of a kind; `suffix` ends the names of functions of <math.h>."""
+    """Returns the C text of an operation on numbers of a kind; `suffix` ends the names of <math.h> functions."""
     c = C_TYPES[kind]
     return OPERATIONS[op].on(kind).format(*args, f=suffix, kind=kind, c=c, u=f"u{c.removeprefix('u')}")
 
@@ -182,7 +182,7 @@ _GUARDED = {
     ),
     "{kind}_of(real x)": ("x != x", "0", "x <= {low} ? {lower} : x >= {high} ? {upper} : ({c})x"),
 }
-"""Prototype, condition, result if the condition holds and result otherwise, of the C functions on integers."""
+"""Prototype -> condition, result if it holds, and result otherwise, for the C functions of integers."""
 
 
 def definitions(names: Collection[str], precision: str) -> str:

@@ -1,7 +1,7 @@
-"""Decides which nodes of a program become scalars or loops, which get arrays, and the order of computation.
+"""Plans a program: which nodes become scalars or loops, which need arrays, and the order of computation.
 
-Small arrays are unrolled into scalars, so that moving elements costs nothing and a compiler keeps them in registers.
-Others become loops over arrays; an elementwise operation with one reader is fused into its reader's loop.
+Small arrays are unrolled into scalars: moving their elements is then free, and compilers keep them in registers. Other
+arrays become loops. An elementwise operation with one reader is fused into its reader's loop.
 """
 
 from collections import Counter
@@ -17,29 +17,29 @@ from dln_jax.export.c.program import Program
 _DEPTH = 16
 """Largest depth of a scalar expression; compilers limit the nesting of parentheses."""
 _GIVEN = ("input", "const", "carry", "counter", "project")
-"""Operations whose values are there when a region begins, or when the loop that they name has ended."""
+"""Operations with values from the start of a region, or from the end of their loop."""
 _FACTORED = ("cholesky", "triangular_solve", "permutation", "geqrf", "householder_product", "eigh")
 PLAIN_MEMORY = ("take", "order", "lu", "call", *_FACTORED)
-"""Operations that read arguments through a pointer."""
+"""Operations with arguments by pointer."""
 
 
 class Plan(NamedTuple):
-    """Decisions about the nodes that the results need."""
+    """Decisions about the nodes for the results."""
 
     order: dict[Region, list[Node]]
     """Nodes of a region in order of computation."""
     unrolled: set[Node]
-    """Nodes that are computed element by element."""
+    """Nodes computed element by element."""
     arrays: set[Node]
-    """Nodes that are stored in an array; others are scalars."""
+    """Nodes stored in an array; others are scalars."""
     root: dict[Node, Node]
-    """Last node of the loop that computes an elementwise node."""
+    """Elementwise node -> last node of its loop."""
     nodes: set[Node]
-    """Nodes with elements that the results need."""
+    """Nodes with needed elements."""
     levels: dict[Node, int]
     """Length of the longest chain of products before a node."""
     reads: dict[Node | None, set[Node]]
-    """Arrays of its region that a step reads; a loop reads the arrays that its body reads, and None the results."""
+    """Arrays of its region read by a step. A loop reads the arrays of its body; None stands for the results."""
     readers: Counter[Node]
     """Number of steps that read an array."""
     beside: dict[Node, Node]
@@ -53,7 +53,7 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     readers, whole, contiguous = _readers(program, results, nodes)
     unrolled = {node for node in nodes if _is_unrolled(node)}
     arrays, followed = set(contiguous), set()
-    # Loops read arrays. A gather that a loop cannot index linearly is first copied to an array.
+    # Loops read arrays. A gather without linear indices in a loop is first copied to an array.
     for node in reversed(nodes):
         looped = any(
             reader in followed if reader.op == "gather" else reader not in unrolled for reader in readers[node]
@@ -95,7 +95,7 @@ def _bodies(program: Program, node: Node) -> list[Loop]:
 
 
 def needed_by(program: Program, results: Iterable[Node]) -> list[Node]:
-    """Returns all nodes that the results need in order, those in the bodies of loops and branches too."""
+    """Returns all needed nodes in order, also in the bodies of loops and branches."""
     reached, waiting = set(), [node for node in results if node.size]
     while waiting:
         node = waiting.pop()
@@ -112,7 +112,7 @@ def needed_by(program: Program, results: Iterable[Node]) -> list[Node]:
 def _readers(
     program: Program, results: list[Node], nodes: list[Node]
 ) -> tuple[dict[Node, list[Node]], set[Node], set[Node]]:
-    """Returns the readers of every node, the nodes read whole, and those read by pointer."""
+    """Returns the readers of every node, the nodes read whole, and the nodes read by pointer."""
     readers: dict[Node, list[Node]] = {node: [] for node in nodes}
     whole, contiguous = {node for node in results if node.size > UNROLL_LIMIT}, set()
     for node in nodes:
@@ -135,7 +135,7 @@ def _is_scalar(node: Node) -> bool:
 
 
 def _fused(nodes: list[Node], readers: dict[Node, list[Node]], whole, unrolled, arrays) -> dict[Node, Node]:
-    """Returns the last node of the loop or scalar expression into which each elementwise node is fused."""
+    """Returns elementwise node -> last node of its loop or scalar expression."""
     root: dict[Node, Node] = {}
     depths = {node: 0 for node in nodes if node.op == "gather" and node in arrays and node in unrolled}
     for node in reversed(nodes):
@@ -155,7 +155,7 @@ def _fused(nodes: list[Node], readers: dict[Node, list[Node]], whole, unrolled, 
 
 
 def _is_read_again(node: Node, readers: list[Node]) -> bool:
-    """Returns whether a scalar occurs more than once in the C of its readers."""
+    """Returns whether a scalar occurs more than once in the C text of its readers."""
     if len(readers) > 1 or readers[0].op != "gather":
         return len(readers) > 1 or OPERATIONS[readers[0].op].repeats_arguments(node.dtype)
     start = sum(arg.size for arg in readers[0].args[: readers[0].args.index(node)])
@@ -174,7 +174,7 @@ def _levels(nodes: list[Node]) -> dict[Node, int]:
 
 
 def _sources(node: Node, arrays: set[Node]) -> set[Node]:
-    """Returns the arrays that are read to evaluate a node."""
+    """Returns the arrays read to evaluate a node."""
     if node.op == "gather" and node not in arrays:
         return {source for arg in node.args for source in _sources(arg, arrays)}
     return {node} & arrays

@@ -2,8 +2,8 @@
 
 Primitives with an operation of the same name in `operations.OPERATIONS` need no rule.
 
-A rule takes the program, the equation's arguments and, by keyword, the parameters that it reads, and returns one or
-several results. Two more keywords are `results`, the abstract values of the results, and `kind`, that of the first.
+A rule takes the program, the equation's arguments and the needed parameters by keyword, and returns one or several
+results. Two more keywords are `results`, the abstract values of the results, and `kind`, the kind of the first.
 """
 
 import functools
@@ -38,7 +38,7 @@ def grouped(program: Program, node: Node, *groups: Sequence[int]) -> Node:
 
 
 def rows_of(program: Program, node: Node, axes: Sequence[int]) -> Node:
-    """Returns the node as a matrix [o, r] whose columns are the elements along `axes`."""
+    """Returns the node as a matrix [o, r] with the elements along `axes` as columns."""
     return grouped(program, node, _others(node, axes), axes)
 
 
@@ -49,7 +49,7 @@ def _others(node: Node, axes: Sequence[int]) -> list[int]:
 def _moved(move: Callable[..., Any]) -> Rule:
     """Returns the rule of a primitive that only moves elements.
 
-    `move` takes one array of element indices per argument, and the parameters; returns those of the results.
+    `move` takes one array of element indices per argument, and the parameters; it returns the indices of the results.
     """
 
     @functools.wraps(move)
@@ -94,7 +94,7 @@ def composed(program: Program, function: Callable[..., Any], nodes: Sequence[Nod
 
 
 def _composed(function: Callable[..., Any]) -> Rule:
-    """Returns the rule of a primitive that a JAX function of the same arguments composes of others."""
+    """Returns the rule of a primitive that a JAX function composes from others."""
 
     @functools.wraps(function)
     def rule(program: Program, *nodes: Node, **parameters: Any) -> list[Node]:
@@ -130,7 +130,7 @@ def _bits(program: Program, x: Node, *, results: Any, kind: str) -> Node:
     """Applies `bitcast_convert_type` between types of one size."""
     word = "unsigned_long" if np.dtype(program.real).itemsize == 8 else "unsigned"
     if results[0].shape != x.shape or (x.dtype == "real" and NUMPY_TYPES[word]().itemsize != results[0].dtype.itemsize):
-        raise InputError("the primitive 'bitcast_convert_type' has C for types of one size")
+        raise InputError("the primitive 'bitcast_convert_type' is supported in C only for types of equal size")
     if x.dtype == "real" != kind:
         return convert(program, program.elementwise(f"{word}_word_of", x), kind)
     return program.elementwise("number_of", convert(program, x, word)) if kind == "real" else convert(program, x, kind)
@@ -149,7 +149,7 @@ def _reduce_precision(program: Program, x: Node, *, exponent_bits: int, mantissa
 
 def _dot_general(program: Program, a: Node, b: Node, *, dimension_numbers, precision: Any, kind: str) -> Node:
     if isinstance(precision, lax.DotAlgorithm | lax.DotAlgorithmPreset):  # it may round operands and sums
-        raise InputError(f"the primitive 'dot_general' has no C with precision={precision}")
+        raise InputError(f"the primitive 'dot_general' is not supported in C with precision={precision}")
     counted = "int" if kind == "bool" else kind
     a, b = (convert(program, node, counted) for node in (a, b))
     (a_sum, b_sum), (a_batch, b_batch) = dimension_numbers
@@ -202,7 +202,7 @@ def _cumulative(combine: Callable[..., Any]) -> Rule:
 def _items(program: Program, node: Node, rank: int = 2) -> list[Node]:
     """Returns the matrices of a batch (vectors for rank 1)."""
     if not node.size:
-        raise InputError(f"factorisations have C of arrays with elements; this one has shape {node.shape}")
+        raise InputError(f"factorisations are supported in C for non-empty arrays; got shape {node.shape}")
     index = np.arange(node.size).reshape(-1, *node.shape[len(node.shape) - rank :])
     return [program.gather([node], positions) for positions in index]
 
@@ -211,7 +211,7 @@ def _applied(
     program: Program, op: str, *arrays: Node, shapes: Sequence[Sequence[int]], ranks: Sequence[int] = (2, 2),
     kind: str = "real", attribute: Any = None,
 ) -> list[Node]:  # fmt: skip
-    """Applies an operation to every item of a batch; the results of one item lie end to end."""
+    """Applies an operation to every item of a batch; the results of one item are concatenated."""
     batch, sizes = arrays[0].shape[: len(arrays[0].shape) - ranks[0]], [prod(shape) for shape in shapes]
     items = zip(*(_items(program, array, rank) for array, rank in zip(arrays, ranks, strict=False)), strict=True)
     nodes = [program.make(op, (sum(sizes),), kind, item, attribute) for item in items]
@@ -273,7 +273,7 @@ def _eigh(program: Program, a: Node, *, lower: bool, subset_by_index) -> list[No
     """Applies `eigh` to the lower or upper triangle; the signs of eigenvectors may differ from LAPACK's."""
     n = a.shape[-1]
     if subset_by_index not in (None, (0, n)):
-        raise InputError("the primitive 'eigh' has C for all eigenvalues; got subset_by_index")
+        raise InputError("the primitive 'eigh' is supported in C only for all eigenvalues; got subset_by_index")
     row, column = np.sort(np.indices((n, n)), axis=0)[:: -1 if lower else 1]
     symmetric = program.gather([a], np.arange(a.size).reshape(a.shape)[..., row, column])
     return _applied(program, "eigh", symmetric, shapes=[(n, n), (n,)])

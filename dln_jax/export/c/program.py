@@ -1,7 +1,8 @@
 """A program of small arrays: a graph of interned nodes, simplified as it is built.
 
-There are few kinds of nodes, because everything that only moves numbers (slices, transposes, concatenations, padding,
-gathers and selections at constant indices) is a `gather`: it names the source of every element. Nested gathers merge.
+There are few kinds of nodes: every operation that only moves numbers (slices, transposes, concatenations, padding,
+gathers and selections at constant indices) is a `gather`, which holds the source of every element. Nested gathers
+merge.
 
 | op | value |
 |---|---|
@@ -20,9 +21,9 @@ gathers and selections at constant indices) is a `gather`: it names the source o
 | `call` | a call of another program |
 | `while`, `repeat`, `branch` | control flow; `project` takes a result, an iteration reads `carry` and `counter` |
 
-Simplifications keep the results of IEEE arithmetic, except the sign of zero in 0 + x = x, which XLA simplifies too.
-1 x = x always holds, but 0 x = 0, 0 / x = 0 and 0 - x = -x hold only for finite numbers: they are applied in programs
-that assume finite arguments (`Program.finite`), so that structural zeros of a derivative cost nothing.
+Simplifications keep the results of IEEE arithmetic, except the sign of zero in 0 + x = x, which XLA simplifies too. 1 x
+= x always holds, but 0 x = 0, 0 / x = 0 and 0 - x = -x hold only for finite numbers. Programs with finite arguments
+(`Program.finite`) use them, so structural zeros of a derivative cost nothing.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -59,20 +60,20 @@ class Program:
     nodes: list[Node] = field(default_factory=list)
     loops: dict[int, Loop] = field(default_factory=dict)
     floor: Region = ()
-    """Region of the branch under construction: its nodes stay in it even if they read nothing computed there."""
+    """Region of the branch under construction; its nodes stay inside even if they do not depend on it."""
     real: Any = np.float64
     """NumPy type of real numbers; constants are folded in it."""
     repeated: Collection[int] = ()
-    """`id` values of jaxprs whose calls stay calls."""
+    """`id` values of jaxprs that remain calls."""
     parts: dict[Any, tuple["Program", list[Node]]] = field(default_factory=dict)
     """Called programs with their results, by the attribute of a `call`: `id` of the jaxpr, and constant arguments."""
     inline: Any = None
     """(program, closed jaxpr, arguments) -> results."""
     finite: bool = False
-    """Whether arguments and intermediate results are finite, so that 0 x = 0."""
+    """True if arguments and intermediate results are finite, so that 0 x = 0."""
     _interned: dict[Any, list[Node]] = field(default_factory=dict)
     _scalars: dict[tuple[Node, Region], list[Node]] = field(default_factory=dict)
-    """Scalars by node and `floor`: scalars made in a branch exist only there."""
+    """Scalars by node and `floor`: scalars of a branch exist only there."""
 
     def make(
         self,
@@ -84,7 +85,7 @@ class Program:
         value: np.ndarray | None = None,
         region: Region = (),
     ) -> Node:
-        """Returns the interned node in the innermost region of its arguments, and so outside loops if possible."""
+        """Returns the interned node in the innermost region of its arguments: outside loops if possible."""
         shape, args = tuple(map(int, shape)), tuple(args)
         if prod(shape) > LARGEST:
             raise InputError(
@@ -107,7 +108,7 @@ class Program:
         return self.make("const", array.shape, dtype, value=np.ascontiguousarray(array).reshape(array.shape))
 
     def gather(self, sources: Sequence[Node], positions: np.ndarray | np.integer) -> Node:
-        """Returns the elements at `positions` [shape] of the sources laid end to end."""
+        """Returns the elements at `positions` [shape] of the concatenated sources."""
         inner, flat, start = [], [], 0
         for source in sources:
             parts, within = sources_of(source)
@@ -145,7 +146,7 @@ class Program:
         args = tuple(arg if arg.shape in ((), shape) else self.broadcast(arg, shape) for arg in args)
         operation = OPERATIONS[op := on_kind(op, kind)]
         dtype = operation.dtype or kind
-        # Repeated real numbers are not folded: the result would be a table, read from memory.
+        # Repeated real numbers are not folded, because the result would be a table in memory.
         known = all(arg.op == "const" or (dtype != "real" and is_constant(arg)) for arg in args)
         if known and operation.fold is not None:
             with np.errstate(all="ignore"):
@@ -162,7 +163,7 @@ class Program:
         return self.make(op, shape, dtype, args)
 
     def _simpler(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
-        """Returns an equal node that takes less work than the operation, or None."""
+        """Returns an equal but cheaper node, or None."""
         a, b = args[0], args[-1]
         for kept, other in ((a, b), (b, a))[: 2 if op in (*COMMUTATIVE, "max", "min") else 1]:
             if (number := neutral(op, a.dtype)) is not None and is_all(other, number):
@@ -200,7 +201,7 @@ class Program:
         return None
 
     def _below_broadcast(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
-        """Returns the operation applied before a common broadcast of its arguments, or None if they share none."""
+        """Returns the operation applied before a common broadcast of its arguments, or None without one."""
         repeated = [arg for arg in args if arg.size > 1 and not is_uniform(arg)]
         if prod(shape) <= 1 or any(arg.op != "gather" or len(arg.args) > 1 for arg in repeated):
             return None
@@ -254,7 +255,7 @@ class Program:
         return node if node.shape == () else self.make("gather", (), node.dtype, (node,), value=np.asarray(place))
 
     def one(self, node: Node) -> Node:
-        """Returns the scalar that all elements equal."""
+        """Returns the common value of all elements as a scalar."""
         return node if node.shape == () else self.gather([node], np.zeros((), np.int64))
 
     def transpose(self, node: Node) -> Node:

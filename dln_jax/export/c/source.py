@@ -38,7 +38,7 @@ STACK = 256 * 1024
 LENGTH = 10_000_000
 """Largest size of a source in bytes."""
 LINES = 4000
-"""A function of more lines, including callees, is not exported by default."""
+"""Largest size in lines, including callees, of a function exported by default."""
 
 
 def export_c(
@@ -54,7 +54,10 @@ def export_c(
     loop_bound: int | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Writes NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt, and returns their paths.
+    """Exports functions of one state as C99: NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt.
+
+    The C code allocates no memory and needs only <math.h>. It gives the numbers of JAX, up to rounding. The header
+    states shapes and units. `load_c` calls the code from Python.
 
     Args:
         functions: name -> (function, examples): a function with its parameters closed over, and one example per
@@ -63,24 +66,36 @@ def export_c(
         directory: folder of the export; created if missing.
         name: a C name; every file and public function starts with it.
         precision: f32 or f64, for all real numbers; default: the precision of the examples.
-        casadi: also write NAME_casadi.c: all functions, or those named, with exact derivatives for CasADi's `external`.
+        casadi: also write NAME_casadi.c: all functions, or the named ones, with exact derivatives for CasADi's
+            `external`.
         leave_out_large: omit functions that exceed the stack or 4,000 lines (which take seconds to compile), and from
-            NAME_casadi.c functions that CasADi cannot take; the files list the omitted functions.
+            NAME_casadi.c functions that CasADi cannot use; the files list the omitted functions.
         stack: bytes of stack that a function may use; a plan over many steps may need more than the default.
-        finite: assume finite arguments and intermediate results. Then 0 x = 0, so that the zeros and ones of a
-            derivative's structure cost nothing; NaN or infinity may reach fewer results than in JAX.
-        loop_bound: bound on the iterations of a `while_loop` whose condition does not compare a counter with a
-            constant. A loop that needs more ends with NaN (integers: the largest; booleans: true).
+        finite: assume finite arguments and intermediate results. Then 0 x = 0, so structural zeros and ones of
+            derivatives cost nothing. NaN or infinity may reach fewer results than in JAX.
+        loop_bound: largest number of iterations of a `while_loop` without a counter in its condition. A loop that needs
+            more ends with NaN (integers: the largest; booleans: true).
         overwrite: replace existing files.
+
+    Returns:
+        The paths of the files.
 
     Raises:
         InputError: a function cannot be written in C or needs more stack, a name is invalid in C, the source exceeds 10
-            MB, files exist, or the folder belongs to a run, whose files are never replaced.
+            MB, files exist, or the folder belongs to a run (runs are never overwritten).
+
+    Example:
+        >>> import numpy as np
+        >>> import dln_jax
+        >>> cart = dln_jax.dynamics(dln_jax.LagrangianSystem(lambda q, qd: 1.5 * qd @ qd))
+        >>> paths = dln_jax.export_c({"torque": (cart.inverse_dynamics, tuple(np.ones((3, 1))))}, "cart-c")
+        >>> print(*[path.name for path in paths])
+        model.h model.c model_demo.c CMakeLists.txt model.json
     """
     require_positive(stack=stack, loop_bound=1 if loop_bound is None else loop_bound)
     check_name(name)
     if not functions:
-        raise InputError("there is no function to export; give at least one, as {'name': (function, examples)}")
+        raise InputError("there is no function to export; pass at least one: {'name': (function, examples)}")
     chosen: dict[str, tuple[Function, Any]] = {}
     for key, pair in functions.items():
         if not (isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[1], tuple | list)):
@@ -93,7 +108,7 @@ def export_c(
         precision = "f32" if "float32" in types and "float64" not in types else "f64"
     require_precision(precision)
     if casadi and precision != "f64":
-        raise InputError("CasADi computes in double; export with precision f64")
+        raise InputError("CasADi computes in double precision; export with precision f64")
     version = importlib.metadata.version("dln-jax")
     written_by = f"Written by dln-jax {version}, C format {FORMAT}."
     empty = Source(precision, finite, loop_bound)
@@ -107,7 +122,7 @@ def export_c(
             with_function = source.copy()
             signature, text, lines = _function(with_function, name, key, signature, closed, repeated)
             if (used := signature.cost.stack_bytes) > stack:
-                large = f"{key} would take {used / 1024:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB"
+                large = f"{key} needs {used / 1024:.0f} KiB of stack; the limit is {stack // 1024} KiB"
             elif leave_out_large and lines > LINES:
                 large = f"{key}, of {lines} lines"
             else:
@@ -133,7 +148,7 @@ def export_c(
             files[f"{name}_casadi.c"] = title + preamble(source, name, text) + text
             files["CMakeLists.txt"] += external.BUILD.format(name=name)
     if (longest := max(map(len, files.values()))) > LENGTH:
-        raise InputError(f"the source would take {longest / 1e6:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")
+        raise InputError(f"the source needs {longest / 1e6:.0f} MB; the limit is {LENGTH / 1e6:.0f} MB")
     encoded = {file_name: text.encode() for file_name, text in files.items()}
     stated = description(name, precision, version, signatures, encoded[f"{name}.h"], encoded[f"{name}.c"])
     return _write(Path(directory), {**encoded, f"{name}.json": stated}, overwrite)
@@ -144,7 +159,7 @@ def _dtype(leaf: Any) -> np.dtype:
 
 
 def _in_written_order(function: Function) -> Function:
-    """Returns the function with its results in the order in which a dictionary was written; JAX would sort the keys."""
+    """Returns the function with dictionaries of results in insertion order; JAX would sort the keys."""
 
     def ordered(tree):
         return OrderedDict((key, ordered(value)) for key, value in tree.items()) if type(tree) is dict else tree
@@ -190,20 +205,20 @@ def _function(
 
 
 def _write(directory: Path, files: Mapping[str, bytes], overwrite: bool) -> list[Path]:
-    """Writes all files or none, and the description last, whose digest `load_c` checks."""
+    """Writes all files or none. The description comes last; `load_c` checks its digest."""
     for path in filter(Path.is_file, directory.glob("*.json")):
         text = path.read_bytes()
         if b'"tensor_file"' in text:
-            raise InputError(f"{directory} is the folder of a run; export to another, such as {directory / 'exported'}")
+            raise InputError(f"{directory} is the folder of a run; choose another, such as {directory / 'exported'}")
         if path.name in files and b'"functions"' not in text:
-            raise InputError(f"{path} describes no export; choose another folder or name")
+            raise InputError(f"{path} does not belong to an export; choose another folder or name")
     existing = [path for name in files if (path := directory / name).exists()]
     for path in existing:
         if not path.is_file():
             raise InputError(f"{path} is not a file and cannot be replaced; choose another folder or name")
     if existing and not overwrite:
         names = ", ".join(path.name for path in existing)
-        raise InputError(f"{directory} holds {names} already; choose another folder or overwrite them")
+        raise InputError(f"{directory} already contains {names}; choose another folder or overwrite them")
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:

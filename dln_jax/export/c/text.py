@@ -20,7 +20,7 @@ C_TYPES: Mapping[str, str] = {
     "unsigned_long": "uint64_t",
     "index": "long long",
 }
-"""C type of each kind. An `index` counts array elements; only the program computes it, so it cannot overflow."""
+"""C type of each kind. An `index` counts array elements. Only the program computes it, so it cannot overflow."""
 NUMPY_TYPES: Mapping[str, Any] = {
     "bool": np.bool_,
     "int": np.int32,
@@ -31,7 +31,7 @@ NUMPY_TYPES: Mapping[str, Any] = {
 }
 """NumPy type of each kind except `real`, which has the precision of the export."""
 SIGNED = ("int", "long")
-"""Integer kinds whose overflow C leaves undefined."""
+"""Integer kinds with undefined overflow in C."""
 UNSIGNED = ("unsigned", "unsigned_long")
 _KINDS = {np.dtype(numpy_type).name: kind for kind, numpy_type in NUMPY_TYPES.items() if kind != "index"}
 # JAX gives integers tangents of the type float0; no program computes with them.
@@ -68,10 +68,10 @@ _RESERVED = frozenset(
 
 
 def kind_of(dtype: Any) -> str:
-    """Returns the kind of a JAX dtype; raises InputError if C has none."""
+    """Returns the kind of a JAX dtype; raises InputError for types without one."""
     if str(dtype) not in _KINDS:
         hint = "draw random numbers beforehand" if str(dtype).startswith("key<") else "cast it to 32 or 64 bits"
-        raise InputError(f"an array has type {dtype}, which generated C does not have; {hint}")
+        raise InputError(f"an array has type {dtype}, which C export does not support; {hint}")
     return _KINDS[str(dtype)]
 
 
@@ -84,7 +84,7 @@ def limit(kind: str, *, upper: bool) -> Any:
 
 
 def failure(kind: str) -> Any:
-    """Returns the value that stands for a missing result: NaN, the largest integer or true."""
+    """Returns the value of a missing result: NaN, the largest integer or true."""
     return np.nan if kind == "real" else limit(kind, upper=True)
 
 
@@ -94,7 +94,7 @@ def check_name(name: str, what: str = "name") -> str:
     if not _NAME.fullmatch(name) or taken or len(name) > 40:
         raise InputError(
             f"{what} is {name!r:.60}; expected a C name: a letter, then letters, digits or _, at most 40, no "
-            "keyword of C or C++ and nothing that their libraries or the source itself define"
+            "keyword of C or C++ and no name that their libraries or the source define"
         )
     return name
 
@@ -105,9 +105,9 @@ def fill(text: str, precision: str, **values) -> str:
 
 
 def number(value, precision: str, kind: str = "real") -> str:
-    """Returns the shortest literal that gives the same number; raises InputError if the precision cannot hold it.
+    """Returns the shortest literal of a number; raises InputError if the precision cannot represent it.
 
-    The lowest 32- and 64-bit integers have no literal in C and are written by name.
+    The lowest 32- and 64-bit integers have no literal in C and use names.
     """
     if kind != "real":
         lowest = {-(2**31): "INT32_MIN", -(2**63): "INT64_MIN"}
@@ -119,7 +119,7 @@ def number(value, precision: str, kind: str = "real") -> str:
     with np.errstate(over="ignore"):
         rounded = numpy_type(value)
     if not np.isfinite(rounded):
-        raise InputError(f"a constant is {value}, which {precision} cannot hold; export in f64")
+        raise InputError(f"a constant is {value}, beyond the range of {precision}; export in f64")
     return f"{rounded!s}{suffix}"
 
 

@@ -14,7 +14,8 @@ EARTH = (0.0, 0.0, -9.81)
 
 
 class Tree(NamedTuple):
-    """Rigid bodies in a tree of d joints, one link behind every joint; a link's frame has its origin at its joint.
+    """Rigid bodies in a tree of d joints. Each joint moves one link, and the origin of the link's frame is at the
+    joint.
 
     At q = 0, link i has the rotation `rotations[i]` and the position `positions[i]` in the frame of its parent link. It
     rotates about `axes[i]`, or slides along it, in its own frame. The structure is plain Python. Known numbers are
@@ -33,7 +34,7 @@ class Tree(NamedTuple):
     inertias: Any
     """[d, 10], inertial parameters of the links in their own frames, in the order of `inertia.PARAMETERS`."""
     armature: Any
-    """[d], motor inertias seen at the joints, kg m² or kg; [d, d] if motors turn with several joints."""
+    """[d], motor inertias reflected to the joints, kg m² or kg; [d, d] if motors turn with several joints."""
     gravity: Any = np.array(EARTH)
     """[3], m/s², in the frame of the ground."""
     names: tuple[str, ...] = ()
@@ -46,7 +47,7 @@ class Tree(NamedTuple):
 
     @property
     def needs(self) -> Needs:
-        """Needs of a model of the tree, without friction, which is specified separately."""
+        """Needs of a model of the tree. Friction is specified separately."""
         still = isinstance(self.gravity, np.ndarray) and not self.gravity.any()
         return Needs(joints=self.joints, gravity=not still)
 
@@ -71,7 +72,7 @@ def make_tree(
     """
     d = len(parents)
     if d == 0 or any(not -1 <= parent < link for link, parent in enumerate(parents)):
-        raise InputError(f"parents are {tuple(parents)}; expected for each link one before it, or -1 for the ground")
+        raise InputError(f"parents are {tuple(parents)}; expected an earlier link for each link, or -1 for the ground")
     if len(joints) != d or not set(joints) <= {"revolute", "prismatic"}:
         raise InputError(f"joints are {tuple(joints)!r:.100}; expected {d} of revolute and prismatic")
     if names and (len(names) != d or len(set(names)) < d):
@@ -87,10 +88,10 @@ def make_tree(
     checked = {name: finite_array(name, array, shape) for name, (array, shape) in arrays.items()}
     turned = checked["rotations"]
     if np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max() > 1e-6 or (np.linalg.det(turned) < 0).any():
-        raise InputError("rotations has a matrix that is not a rotation; expected orthonormal columns, right-handed")
+        raise InputError("rotations has an invalid matrix; expected orthonormal right-handed columns")
     A = checked["armature"]
     if A.ndim == 2 and (np.abs(A - A.T).max() > 1e-9 * np.abs(A).max() or np.linalg.eigvalsh(A)[0] < -1e-9 * A.max()):
-        raise InputError("armature is not a symmetric positive semidefinite matrix; expected that of motors' inertias")
+        raise InputError("armature is not symmetric positive semidefinite; expected the inertia matrix of the motors")
     lengths = np.linalg.norm(checked["axes"], axis=1)
     if not (lengths > 0).all():
         raise InputError(f"joint {int(np.argmin(lengths))} has an axis of length zero; expected a direction")
@@ -129,7 +130,7 @@ def dh_frames(rows: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_payload(tree: Tree, link: int, inertia: Inertia, *, rotation: Any = None, position: Any = None) -> Tree:
-    """Adds a body fixed to a link; rotation and position are those of the body's frame in the link's frame.
+    """Adds a body fixed to a link; rotation and position place the body's frame in the link's frame.
 
     Raises:
         InputError: there is no such link.

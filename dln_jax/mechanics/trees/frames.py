@@ -1,6 +1,6 @@
 """Frames of a tree's links, and vectors between them.
 
-All joints are about z of their link: `aligned` rotates links accordingly. Exchanges of axes cost only signs.
+All joints are about z of their link: `aligned` rotates links accordingly. Permuting axes costs only signs.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ class Placed(NamedTuple):
 
 
 def aligned(tree: Tree) -> Tree:
-    """Returns the same bodies and joints in frames whose joint axis is z; frames and payloads of links change."""
+    """Returns the same tree with every joint about z of its link's frame; the frames and payloads of links change."""
     about_z = np.tile([0.0, 0.0, 1.0], (len(tree.axes), 1))
     if not isinstance(tree.axes, np.ndarray) or np.array_equal(tree.axes, about_z):
         return tree
@@ -49,7 +49,8 @@ def aligned(tree: Tree) -> Tree:
 
 
 def _onto(axis: np.ndarray) -> np.ndarray:
-    """Returns a rotation whose third column is the axis; its entries are integers if that is an axis of the frame."""
+    """Returns a rotation with the axis as third column; its entries are integers if the axis is one of the frame's
+    own."""
     place = int(np.argmax(np.abs(axis)))
     first = np.eye(3)[(place + 1) % 3]
     first = first - axis * (axis @ first)

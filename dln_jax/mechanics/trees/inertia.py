@@ -35,7 +35,7 @@ def parts(theta: Inertia) -> tuple[Any, Any, Any]:
 
 
 def moved(theta: Inertia, rotation: Any, position: Any) -> Inertia:
-    """Returns theta of a body in a frame where its own frame has this rotation (columns are its axes) and position."""
+    """Returns theta in another frame; rotation (columns are axes) and position place the body's frame in it."""
     numpy, own, R, r = _alike(theta, rotation, position)
     m, h, moments = parts(own)
     turned = R @ h
@@ -56,7 +56,7 @@ def pseudo_inertia(theta: Inertia) -> Any:
 
 
 def body_of_pseudo_inertia(J: Any) -> Inertia:
-    """Returns theta of the body whose `pseudo_inertia` is J [4, 4]."""
+    """Returns theta from the pseudo-inertia J [4, 4]; inverts `pseudo_inertia`."""
     numpy, own = _alike(J)
     return _joined(numpy, own[3, 3], own[:3, 3], numpy.trace(own[:3, :3]) * np.eye(3) - own[:3, :3])
 
@@ -66,7 +66,7 @@ def _joined(numpy: Any, m: Any, h: Any, moments: Any) -> Any:
 
 
 def _alike(*arrays: Any) -> list[Any]:
-    """Returns JAX if any is one of its arrays, NumPy otherwise, and all as arrays of it."""
+    """Returns jax.numpy if any array is a JAX array, otherwise numpy, and the arrays converted to it."""
     if any(isinstance(array, Array) for array in arrays):
         return [jnp, *map(jnp.asarray, arrays)]
     return [np, *(np.asarray(array, float) for array in arrays)]

@@ -3,10 +3,10 @@
     motor rates = S qd,   A = Sᵀ (diag(I) + C) S,   M = M_links + A
 
 S [d, d] is a known constant matrix, the identity if every motor turns only with its own joint. If a parallelogram or a
-belt drives joint 3 from a motor that does not move with joint 2, its rate is qd_2 + qd_3, so row 3 of S is (0, 1, 1).
-I [d] are the inertias of the motors at that rate. C is symmetric with a zero diagonal, and non-zero only at stated
-pairs of joints: the constant inertia by which one joint's acceleration loads another joint's motor, for unknown gear
-ratios. A motor of joint 3 on link 2 with gear ratio n, parallel to joint 2, has C_23 = I_3 / n.
+belt drives joint 3 from a motor that does not move with joint 2, its rate is qd_2 + qd_3, so row 3 of S is (0, 1, 1). I
+[d] are the inertias of the motors at that rate. C is symmetric with a zero diagonal, and non-zero only at stated pairs
+of joints: the constant inertia that couples one joint's acceleration to another joint's motor if gear ratios are
+unknown. A motor of joint 3 on link 2 with gear ratio n, parallel to joint 2, has C_23 = I_3 / n.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,18 +21,19 @@ from dln_jax.types import InputError, Vector, finite_array
 Pair = tuple[int, int]
 """Two joints, counted from 0, the lower one first."""
 LARGEST_CONDITION = 1e6
-"""Largest condition number of S; beyond it, motor rates hardly determine joint rates."""
+"""Largest condition number of S; above it, motor rates hardly determine joint rates."""
 
 
 def require_motors(rates: Any, coupled: Sequence[Pair], d: int) -> None:
-    """Raises `InputError` unless `rates` is an invertible matrix S or `None`, and the pairs are of different joints."""
+    """Raises `InputError` unless `rates` is an invertible matrix S or `None`, and each pair has two different
+    joints."""
     if rates is not None:
         S = finite_array("motors", rates, (d, d))
         if not np.linalg.cond(S) < LARGEST_CONDITION:
-            raise InputError(f"motors is {S.tolist()}; expected a matrix S of motor rates S qd that can be inverted")
+            raise InputError(f"motors is {S.tolist()}; expected an invertible matrix S, motor rates = S qd")
     if len(set(coupled)) < len(coupled) or not all(0 <= i < j < d for i, j in coupled):
         stated = ", ".join(f"{i + 1}:{j + 1}" for i, j in coupled)
-        raise InputError(f"coupled is {stated}; expected each pair of different joints, 1 to {d}, once, lower first")
+        raise InputError(f"coupled is {stated}; expected distinct pairs i:j of joints with 1 <= i < j <= {d}")
 
 
 def armature_matrix(inertias: Any, rates: Any = None, coupling: Mapping[Pair, Any] | None = None) -> Any:
@@ -59,7 +60,7 @@ def motor_regressor(rates: Any, coupled: Sequence[Pair], qdd: Vector) -> Float[A
 def motors_of(
     armature: Float[np.ndarray, "d d"] | Float[np.ndarray, " d"], rates: Any, coupled: Sequence[Pair]
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " pairs"]]:
-    """Returns I and the entries of C that give an armature.
+    """Returns I and the entries of C that produce this armature.
 
     Raises:
         InputError: the motors and pairs cannot have this armature.
@@ -77,7 +78,7 @@ def motors_of(
     if np.abs(rest).max(initial=0.0) > 1e-9 * max(np.abs(A).max(initial=0.0), np.finfo(float).tiny):
         i, j = np.unravel_index(np.argmax(np.abs(rest)), rest.shape)
         raise InputError(
-            f"the robot's armature couples joints {min(i, j) + 1} and {max(i, j) + 1}, which the stated motors do not; "
+            f"the robot's armature couples joints {min(i, j) + 1} and {max(i, j) + 1}, but the stated motors do not; "
             f"state their rates (--motors), or couple them (--coupled {min(i, j) + 1}:{max(i, j) + 1})"
         )
     return np.diag(A).copy(), entries

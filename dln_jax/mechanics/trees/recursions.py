@@ -5,10 +5,10 @@ after Featherstone, Rigid Body Dynamics Algorithms, 2008, in about a hundred ope
 frame of their link, forces about its origin. Gravity is an acceleration of the ground.
 
 These unroll the links, so that zeros of known frames cost nothing. `scanned_forces` and `scanned_regressor` instead
-scan the links of a tree with learned frames: quick to compile and to differentiate. No frame is known there, and every
-joint is about z of its link, whatever the tree's axes. In every link's frame the scan carries the link's motions for
-unit rates of the joints (the columns of its Jacobian), its own motion and its acceleration, all as spatial vectors. The
-forces of the links are then independent.
+scan the links of a tree with learned frames, which compiles and differentiates fast. They assume that every joint turns
+about z of its link, and ignore the tree's axes. In every link's frame the scan carries the Jacobian of the link (its
+motions for unit rates of the joints), its velocity and its acceleration, all as spatial vectors. The forces of the
+links are then independent.
 """
 
 from typing import Any
@@ -64,7 +64,8 @@ def _motor_momentum(tree: Tree, rates: Vector) -> Vector:
 def _on_parent(motion: Any, frame: Placed, gravity: Any) -> tuple[Any, Any, Any]:
     """Returns angular velocity and acceleration, and the acceleration of the link's origin, with the joint locked.
 
-    Angular quantities are `None` if zero: on the ground, and behind prismatic joints from there.
+    Angular quantities are `None` where they are zero: on the ground, and on links connected to it by prismatic joints
+    only.
     """
     if motion is None:
         return None, None, outwards(frame, -jnp.asarray(gravity, jnp.result_type(float)))
@@ -77,7 +78,7 @@ def _on_parent(motion: Any, frame: Placed, gravity: Any) -> tuple[Any, Any, Any]
 
 
 def _force(theta: Any, w: Any, dw: Any, a: Any) -> tuple[Any, Any]:
-    """Returns the force and moment that a body's motion needs."""
+    """Returns the force and moment that accelerate a body."""
     m, h, moments = parts(theta)
     force, moment = m * a, cross(h, a)
     if w is not None:
@@ -181,11 +182,24 @@ def lagrangian(tree: Tree) -> Lagrangian:
 
 
 def tree_system(tree: Tree, dissipation: Dissipation | None = None) -> ExplicitSystem:
-    """Returns the record for `equations.dynamics`, with forces by recursions.
+    """Returns the system of a tree of rigid bodies, for `dynamics` and `flow`.
+
+    Forces come from the recursive Newton-Euler algorithm (Luh, Walker and Paul 1980), the mass matrix from composite
+    rigid bodies (Walker and Orin 1982). Cost grows linearly with the number of links for forces.
 
     Args:
-        tree: a tree of known or learned numbers.
-        dissipation: (q, qd) -> Rayleigh function.
+        tree: a tree of known or learned numbers, from `read_robot`, `make_tree` or `serial`.
+        dissipation: (q, qd) -> Rayleigh function in W, such as from `joint_dissipation`.
+
+    Example:
+        >>> import numpy as np
+        >>> import dln_jax
+        >>> from dln_jax.mechanics.trees.description import serial
+        >>> inertia = [[2.0, 0.6, 0, 0, 0.1, 0, 0, 0.2, 0, 0.2]]  # m, m c (kg m), ixx ixy ixz iyy iyz izz (kg m²)
+        >>> arm = serial(np.eye(3)[None], [[0, 0, 0]], inertia, gravity=(0, -9.81, 0))
+        >>> torque = dln_jax.dynamics(dln_jax.tree_system(arm)).inverse_dynamics([0.0], [0.0], [1.0])
+        >>> print(f"{torque[0]:.3f} N m")  # 0.2 kg m² times 1 rad/s², and 0.6 kg m times 9.81 m/s²
+        6.086 N m
     """
     return ExplicitSystem(
         mass_matrix=lambda q: composite_bodies(tree, q),

@@ -47,8 +47,8 @@ def default_data(scene: Scene) -> Trajectories:
 def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Trajectories:
     """Returns letters written by the tip of the two-link arm, one trajectory each, sampled every `dt` s.
 
-    The outlines come from matplotlib's bundled font, smoothed. Angles, rates and torques follow exactly from the tip's
-    path by inverse kinematics, differentiation and the closed-form equations of motion.
+    The outlines come from matplotlib's bundled font, smoothed. Inverse kinematics, differentiation and the closed-form
+    equations of motion give exact angles, rates and torques from the tip's path.
     """
     require_finite(dt=dt)
     durations, positions = zip(*map(letter_path, letters), strict=True)
@@ -68,7 +68,7 @@ def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Traject
 
         return jax.vmap(motion)(t)
 
-    # All letters use the longest duration and thus share a compilation; beyond its end a path rests.
+    # All letters use the longest duration and thus share one compilation. A path rests after its end.
     longest = dt * np.arange(max(map(len, times)))
     motions = [states(position, longest) for position in positions]
     cut = [[np.asarray(values)[: len(t)] for values in motion] for motion, t in zip(motions, times, strict=True)]
@@ -90,8 +90,8 @@ def uniform(
 ) -> Trajectories:
     """Returns independent random states, one per trajectory, uniform in a box symmetric about zero.
 
-    Bounds are in rad or m, 1/s, 1/s² and N m or N. If the scene is fully actuated, accelerations are drawn; otherwise
-    controls are drawn and accelerations follow from them.
+    Bounds are in rad or m, 1/s, 1/s² and N m or N. For a fully actuated scene accelerations are drawn. Otherwise
+    controls are drawn and the accelerations computed.
     """
     require_finite(samples=samples, position_bound=position_bound, rate_bound=rate_bound)
     require_finite(acceleration_bound=acceleration_bound, control_bound=control_bound)
@@ -140,12 +140,12 @@ def free_swing(
 
 
 def _require_room(samples: int, scene: Scene) -> None:
-    # Ten arrays of the schema, and as much again while they are computed.
+    # Ten arrays of the schema, and the same amount for intermediate results.
     require_memory(f"{samples:,} samples", 160.0 * samples * scene.needs.degrees_of_freedom)
 
 
 def swings(scene: Scene, t, q: Float[np.ndarray, "K T d"], qd: Float[np.ndarray, "K T d"]) -> Trajectories:
-    """Returns motions without torque at common times t [T]; accelerations are those of the scene at these states."""
+    """Returns motions without torque at common times t [T]; accelerations are computed from the states."""
     count, times, d = q.shape
     q, qd = q.reshape(-1, d), qd.reshape(-1, d)
     qdd = np.asarray(_batched(closed_form_forward_dynamics, scene)(q, qd, np.zeros_like(q)))
@@ -177,7 +177,9 @@ def rollouts(
 
     motions, successful = solve(q, qd)
     if not bool(successful.all()):
-        raise InputError(f"the motion could not be integrated to {tolerance:g}; ask for less accuracy or time")
+        raise InputError(
+            f"the integration failed at tolerance {tolerance:g}; raise the tolerance or shorten the motion"
+        )
     return np.asarray(motions[0]), np.asarray(motions[1])
 
 
@@ -187,7 +189,7 @@ def completed(scene: Scene, t, q, qd, qdd, trajectory, label) -> Trajectories:
     def momentum(scene: Scene, q, qd, qdd):
         return jax.jvp(functools.partial(lagrangian.momentum, scene.lagrangian), (q, qd), (qd, qdd))
 
-    # Compiled separately, since fusing them would change the last digits of the datasets.
+    # Compiled separately: fusion would change the last digits of the datasets.
     known = dynamics(scene.closed_form)
     tau = np.asarray(jax.jit(jax.vmap(known.inverse_dynamics))(q, qd, qdd))
     parts = map(np.asarray, jax.jit(jax.vmap(known.decompose))(q, qd, qdd))

@@ -1,4 +1,4 @@
-"""Datasets of Hamiltonian tasks: four published ones, damped oscillators, and two systems with two coordinates.
+"""Datasets of Hamiltonian tasks: four published tasks, damped oscillators, and two systems with two coordinates.
 
 Published (Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks"):
 
@@ -9,13 +9,14 @@ Published (Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks"):
 | `two_body` | ½ p² - 1/r | 1000 x 50 | 0..20 | ±x, x in [0.5, 1.5]² | none | the first fifth |
 | `three_body` | ½ p² - sum 1/r_ij | 5000 x 20 | 0..5 | equilateral, 0.9..1.2 from the centre | none | the first fifth |
 
-Directions of (q, p), and of the triangle, are those of a point drawn in a square, so diagonals are more likely. Two
-bodies start on a circular orbit with speeds multiplied by 1 + 0.05 normal. Three bodies start with every velocity
-component multiplied by 1 + 0.2 uniform(-1, 1), so their centre of mass drifts. Times are evenly spaced, ends included.
+Directions of (q, p) and of the triangle point to a random point in a square, so diagonals are more likely. The two
+bodies start on a circular orbit with speeds multiplied by 1 + 0.05 normal. For the three bodies every velocity
+component is multiplied by 1 + 0.2 uniform(-1, 1), so their centre of mass drifts. Times are evenly spaced, ends
+included.
 
-Convention for the derivatives: `qd` and `pd` are the exact field at the NOISELESS point, while q and p are noisy. The
-true field therefore has a test loss due to the noise: 3.82e-2 on the spring and 3.56e-2 on the pendulum with seed 0. To
-compare models, use `field`, the exact field at the noisy point. Units are those of the table, with unit masses and G.
+Convention for the derivatives: `qd` and `pd` are the exact field at the NOISELESS point, while q and p are noisy.
+Because of the noise, the true field has a test loss: 3.82e-2 on the spring and 3.56e-2 on the pendulum with seed 0. To
+compare models, use `field`, the exact field at the noisy point. Units are as in the table, with unit masses and G.
 
 Added by this project, with the same conventions: `damped-spring` and `damped-pendulum` (the first two tasks with a
 viscous friction of 0.1), and, without noise, 100 trajectories x 50 samples each, the first fifth for the test:
@@ -54,10 +55,10 @@ _GROUP = 500
 
 
 class PhaseSamples(NamedTuple):
-    """One side of the published split; all members have the same N samples."""
+    """One side of the published split: the same N samples with and without noise."""
 
     data: Trajectories
-    """As published: q and p with noise; qd, pd (and qdd) of the noiseless motion; tau = 0 exactly."""
+    """As published: q and p with noise; qd, pd (and qdd) without noise; tau = 0 exactly."""
     clean: Trajectories
     """The same samples without noise."""
     field: Trajectories
@@ -114,7 +115,7 @@ def three_body(seed: int = 0, *, trajectories: int = 5000) -> PhaseTask:
         direction = 2 * random.rand(2) - 1
         radius = 0.9 + 0.3 * random.rand()
         x = direction * radius / np.hypot(*direction)
-        # The inward pull on a body is 1 / (sqrt(3) radius²), which keeps it on a circle at this velocity.
+        # At this velocity the inward pull 1 / (sqrt(3) radius²) keeps a body on a circle.
         velocity = _turned(x, np.pi / 2) / (radius**1.5 * 3**0.25)
         change = 1 + 0.2 * (2 * random.rand(3, 2) - 1)
         q, p = (np.array([_turned(vector, k * third) for k in range(3)]) for vector in (x, velocity))
@@ -147,7 +148,7 @@ def double_pendulum(seed: int = 0, *, trajectories: int = 100) -> PhaseTask:
 @functools.cache
 def _system(make: Callable[[], Scene]) -> tuple[Scene, Hamiltonian]:
     scene = make()
-    # One Newton step is exact, because the kinetic energy is quadratic.
+    # One Newton step is exact for a quadratic kinetic energy.
     return scene, hamiltonian.legendre(scene.lagrangian, iterations=1)
 
 
@@ -187,7 +188,7 @@ def _oscillator(
     noise: float,
 ) -> PhaseTask:
     if not noise >= 0:
-        raise InputError(f"noise is {noise}; expected a standard deviation, zero for none")
+        raise InputError(f"noise is {noise}; expected a standard deviation of at least 0")
     random = np.random.RandomState(seed)
     starts, errors = [], []
     for _ in range(trajectories):
@@ -208,7 +209,8 @@ def _task(
     errors: Float[np.ndarray, "K two T d"] | None = None,
     training: slice | None = None,
 ) -> PhaseTask:
-    """Makes a task from starts (q, p) at the times t, with errors of both; by default the first fifth is the test.
+    """Returns a task from starts (q, p) at the times t, with errors added to both; by default the first fifth is the
+    test.
 
     Raises:
         InputError: one side of the split has no trajectories.
@@ -217,7 +219,7 @@ def _task(
     train = order[training or slice(len(order) // 5, None)]
     test = np.setdiff1d(order, train)
     if not len(train) or not len(test):
-        raise InputError(f"trajectories is {len(starts)}; expected enough to leave some on both sides of the split")
+        raise InputError(f"trajectories is {len(starts)}; expected enough for both sides of the split")
     d = scene.needs.degrees_of_freedom
     motion = reference_motion(H, starts[:, 0], starts[:, 1], t, dissipation=scene.dissipation)
     exact = functools.partial(_fields, H, scene.dissipation)
@@ -256,12 +258,15 @@ def reference_motion(
         InputError: an integration does not finish, for example because bodies meet.
     """
     require_positive(tolerance=tolerance)
-    # All motions of a call take as many steps as the slowest one, so groups save time. The last group is padded.
+    # All motions of a call take as many steps as the slowest one, so smaller groups save time. The last group is
+    # padded.
     size = min(len(q), _GROUP)
     groups = [np.minimum(np.arange(first, first + size), len(q) - 1) for first in range(0, len(q), size)]
     solved = [_solve(H, dissipation, tolerance, q[group], p[group], t) for group in groups]
     if not all(successful.all() for _, successful in solved):
-        raise InputError(f"a motion could not be integrated to {tolerance:g}; ask for less accuracy or time")
+        raise InputError(
+            f"the integration failed at tolerance {tolerance:g}; raise the tolerance or shorten the motion"
+        )
     q, p = (np.concatenate([states[half] for states, _ in solved])[: len(q)] for half in range(2))
     return q, p
 

@@ -35,7 +35,7 @@ LETTERS = "abcdeghlmnopqrsuvwyz"
 _SAMPLES = 4096
 """Number of points per contour for computing the Fourier series."""
 _HARMONICS = 96
-"""Highest harmonic of the series; with the default smoothing the remainder is below a micrometre."""
+"""Highest harmonic of the series; its error is below a micrometre with the default smoothing."""
 
 
 class _DesignUnits(TextToPath):
@@ -45,26 +45,26 @@ class _DesignUnits(TextToPath):
 
 
 def outline(character: str) -> list[Float[np.ndarray, "_ 2"]]:
-    """Returns closed polygons along the outline of a glyph of DejaVu Sans, one [points, 2] per contour.
+    """Returns the outline of a glyph of DejaVu Sans as closed polygons, one [points, 2] per contour.
 
     Coordinates are in font units (1/2048 em), y up from the baseline; the last point repeats the first.
 
     Raises:
-        InputError: `character` is not a single printable character whose glyph has an outline.
+        InputError: `character` is not a single printable character with an outline.
     """
     expected = "expected one printable character with an outline in DejaVu Sans, such as 'a'"
     if not isinstance(character, str) or len(character) != 1:
         raise InputError(f"character is {character!r}, a {type(character).__name__}; {expected}")
-    # By file, not by name: a name would match a user's font of that name first.
+    # A name would find a user's font of that name first.
     file = str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf"))
     if not character.isprintable() or get_font(file).get_char_index(ord(character)) == 0:
-        raise InputError(f"character is {character!r}, which the font lacks; {expected}")
+        raise InputError(f"character is {character!r}, not in the font; {expected}")
     font = FontProperties(family="DejaVu Sans", fname=file)
     vertices, codes = _DesignUnits().get_text_path(font, character)
-    # The font's points are integers, and the points that TrueType implies between them are multiples of one half.
+    # The font's points are integers; TrueType's implied points between them are multiples of one half.
     exact = np.round(2.0 * np.asarray(vertices, np.float64).reshape(-1, 2)) / 2.0
     outlines = Outline(exact, codes).to_polygons() if len(exact) > 0 else []
-    # Fonts contain lone anchor points, which draw nothing.
+    # Single anchor points of a font draw nothing.
     polygons = [polygon for polygon in map(np.asarray, outlines) if np.ptp(polygon, axis=0).max() > 0.0]
     if not polygons:
         raise InputError(f"character is {character!r}, an empty glyph; {expected}")
@@ -78,9 +78,9 @@ def _contour(
     smoothing: float,
     bend_radius: float,
 ) -> tuple[Float[np.ndarray, "harmonics 2"], Float[np.ndarray, "harmonics 2"], float]:
-    """Returns the smooth stroke along a closed polygon, from its point nearest to the pen (`None`: top left).
+    """Returns the smooth stroke along a closed polygon. It starts nearest to the pen (`None`: top left).
 
-    The stroke is the coefficients of cos(2 pi k phase) and of sin(2 pi k phase), k = 0, 1, .., and its length, in m.
+    Returns the coefficients of cos(2 pi k phase) and sin(2 pi k phase), k = 0, 1, .., and the length in m.
     """
     corners = polygon @ np.array([1.0, 1.0j])
     arc = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(corners)))])
@@ -94,7 +94,7 @@ def _contour(
     stretch = np.abs(first)
     curvature = np.imag(np.conj(first) * second) / stretch**3
     weight = stretch * (1.0 + (curvature * bend_radius) ** 2) ** 0.25
-    # Also blurred, so that the pen brakes ahead of a bend and not in it.
+    # The blur makes the pen brake ahead of a bend.
     weight = np.fft.ifft(np.fft.fft(weight) * blur).real
     top_left = np.argmax(curve.imag - 0.5 * curve.real)
     start = top_left if pen is None else np.argmin(np.abs(curve - pen @ np.array([1.0, 1.0j])))
@@ -131,7 +131,7 @@ def _position(
 ) -> Float[Array, "2"]:
     """Returns the tip at this time; `starts` and `shares` of the strokes are relative to the duration.
 
-    `ramps` are the fractions of its own time during which a stroke speeds up, and again slows down, at most 1/2.
+    `ramps` are the fractions of a stroke's time for speeding up, and for slowing down, at most 1/2.
     """
     relative = jnp.clip(time / duration, 0.0, 1.0)
     stroke = jnp.sum(relative >= starts[1:])
@@ -161,18 +161,18 @@ def letter_path(
 ) -> tuple[float, Callable[[Scalar], Float[Array, "2"]]]:
     """Returns the tip's motion along the outline of a character; the module docstring describes the steps.
 
-    The results are the time from rest to rest in s, and a function: time in s -> tip (x, y) in m. `jax.jvp` gives the
-    velocity, and once more the acceleration. The function is a pytree: passed to a jitted function as an argument, all
-    letters with the same number of strokes share one compilation. It is constant before and after the motion and
-    computes in JAX's default float.
+    Returns the duration in s, from rest to rest, and a function: time in s -> tip (x, y) in m. `jax.jvp` gives the
+    velocity, and applied twice the acceleration. The function is a pytree. If a jitted function takes it as an
+    argument, all letters with the same number of strokes share one compilation. It is constant before and after the
+    motion and computes in JAX's default float.
 
     Args:
-        character: one printable character of DejaVu Sans that has an outline.
+        character: one printable character with an outline in DejaVu Sans.
         height: height of a lower-case x, m; characters share this scale and keep the font's proportions.
         centre: (x, y) in m of the point midway across the character and half an x-height above the baseline.
         mean_speed: length of the path divided by its duration, m/s; it only scales time.
         smoothing: standard deviation of the Gaussian along the contour, m; corners are rounded by about this.
-        bend_radius: the pen slows down where the radius of curvature falls below this, m.
+        bend_radius: the pen slows down in bends of a smaller radius, m.
         ramp_length: cost of one start and one stop as an equivalent distance at full speed, m.
 
     Raises:

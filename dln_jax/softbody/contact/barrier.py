@@ -2,13 +2,13 @@
 
     E = kappa A m(c) b(D) / h³,    b(D) = -(D - h²)² ln(D / h²) for 0 < D < h², else 0
 
-with the squared distance D of the pair, the distance h within which it acts, the area A that the pair represents and
-the stiffness kappa in Pa. b is twice continuously differentiable at D = h² and grows without bound as D approaches
-zero, so bodies never touch. Nearly parallel edges are mollified, because the closest points of two edges jump there:
+with the squared distance D of the pair, the range h of the barrier, the area A of the pair and the stiffness kappa in
+Pa. b is twice continuously differentiable at D = h² and grows without bound as D approaches zero, so bodies never
+touch. Nearly parallel edges are mollified, because the closest points of two edges jump there:
 
     m(c) = (2 - c/epsilon) c/epsilon for c < epsilon, else 1,    c = |u x v|²,    epsilon = 1e-3 |U|² |V|²
 
-for edges u, v, which are U, V in the rest shape. Derivatives are written by hand, which compiles several times faster.
+for edges u, v, with U, V in the rest shape. Explicit formulas for the derivatives compile several times faster.
 """
 
 from collections.abc import Callable
@@ -62,7 +62,7 @@ class Contact(NamedTuple):
     mesh: Mesh | None = None
     """As in `Term`."""
     changing: bool = True
-    """Whether the set of elements changes during a motion."""
+    """True if the set of elements changes during a motion."""
 
     @property
     def friction(self) -> tuple[MovingEnergy, ...]:
@@ -79,7 +79,7 @@ class Pair(NamedTuple):
     near: Float[Array, "*pairs"]
     """h² in m²."""
     parallel: Float[Array, "*pairs"]
-    """epsilon in m⁴ of two edges; zero for other pairs, which are not mollified."""
+    """epsilon in m⁴ of two edges; zero for other pairs, without mollifier."""
 
 
 def contact_parameters(
@@ -111,7 +111,7 @@ def pair_gradient(x: Float[Array, "k dim"], pair: Pair) -> tuple[Float[Array, ""
     if x.shape == (4, 3):
         m, m_slope, _ = _mollifier(x, pair.parallel)
         value, along = m * value, m * along + value * m_slope
-    # Unused slots hold arbitrary vertices, even coinciding ones.
+    # Unused slots hold arbitrary vertices, possibly at the same position.
     used = pair.strength > 0
     return jnp.where(used, pair.strength * value, 0), jnp.where(used, pair.strength * along, 0)
 
@@ -183,4 +183,4 @@ SLIDING = MovingEnergy(
     hessian=_sliding_hessian,
     longest=lambda x, step, elements, data: jnp.ones((), x.dtype),
 )
-"""Friction of points that are weighted sums of vertices; its data are the elements, and their slips and weights."""
+"""Friction of points that are weighted sums of vertices. Its data are the elements with their slips and weights."""

@@ -1,11 +1,11 @@
-"""Contact between and within bodies by barriers on the distances of their surfaces (Li et al. 2020).
+"""Contact between and within bodies, by barriers on surface distances (Li et al. 2020).
 
 The energies sum over all pairs without a common vertex: vertex and edge in the plane, vertex and triangle or two edges
-in space. Every Newton step searches for the near pairs again, in lists of fixed capacity, and continuous collision
-detection limits the steps, so that no pair ever crosses.
+in space. Every Newton step searches for near pairs again, in lists of fixed capacity. Continuous collision detection
+limits the steps, so no pair ever crosses.
 
-Friction is lagged: normal forces and tangent planes are those at the start of the time step, or at the previous
-solution of this step where `make_step` iterates,
+Friction is lagged: it uses the normal forces and tangent planes at the start of the time step, or at the previous
+solution if `make_step` iterates,
 
     D = mu lambda f(|u|),    u = (1 - n nᵀ) sum_i w_i (x_i - x_i(start)),
 
@@ -58,7 +58,7 @@ from dln_jax.solvers.elements.moving import Elements, MovingEnergy
 from dln_jax.types import InputError, require_positive
 
 _AT_ONCE = 256
-"""Number of pairs whose distance is measured in one turn of a loop; no list is shorter."""
+"""Number of distances per turn of a loop; no list is shorter."""
 
 
 class Kind(NamedTuple):
@@ -69,7 +69,7 @@ class Kind(NamedTuple):
     number: int
     """Number of the kind in `distances`."""
     neighbours: tuple[int, int]
-    """Number of pairs of clusters, and of primitives, whose boxes meet in the rest shape."""
+    """Number of cluster pairs, and of primitive pairs, with intersecting boxes in the rest shape."""
 
 
 def body_contact(
@@ -85,18 +85,18 @@ def body_contact(
     """Contact of all bodies of a mesh with each other and with themselves.
 
     Args:
-        mesh: its boundary is in contact.
+        mesh: the bodies; their boundaries are in contact.
         distance: h in m; surfaces repel each other when closer. Well below the edge length.
-        stiffness: kappa in Pa. The gap at which the contact carries a pressure p depends only on p / kappa and h: with
-            kappa = p about half of h remains. Bodies never cross, whatever the stiffness.
-        friction: Coulomb's coefficient, reached at the threshold speed in m/s.
+        stiffness: kappa in Pa. The gap under a pressure p depends only on p / kappa and h: with kappa = p it is about h
+            / 2. Bodies never cross at any stiffness.
+        friction: Coulomb's coefficient, fully developed at the threshold speed in m/s.
         capacity: slots in the list of near pairs, for every kind of pair; by default two per boundary vertex and at
             least 128. A step that needs more does not converge, and its `Info.overflow` is true.
         name: key of its parameters in `Params.terms`.
 
     Raises:
-        InputError: a number that is not positive, or surfaces of one body that are closer than the distance in the rest
-            shape, which would push each other apart.
+        InputError: a number is not positive, or surfaces of one body are closer than the distance in the rest shape and
+            would repel each other.
     """
     require_positive(distance=distance, threshold_speed=threshold_speed, capacity=1 if capacity is None else capacity)
     surface = surface_of(mesh)
@@ -148,7 +148,7 @@ def _kinds(surface: Surface, rest: np.ndarray, distance: float) -> tuple[Kind, .
 
 
 def _require_gaps(mesh: Mesh, kinds: tuple[Kind, ...], distance: float) -> None:
-    """Refuses a distance within which a body pushes itself apart in its rest shape; other bodies may be as close."""
+    """Refuses a distance at which a body repels itself in its rest shape; different bodies may be as close."""
     rest, body = jnp.asarray(mesh.vertices), components_of_vertices(mesh)
     for kind in kinds:
         one, other = meeting(*(boxes(of, rest, rest, distance / 2) for of in (kind.one, kind.other))).T
@@ -161,12 +161,12 @@ def _require_gaps(mesh: Mesh, kinds: tuple[Kind, ...], distance: float) -> None:
         if near.any():
             raise InputError(
                 f"the vertices {corners[np.argmax(near)].tolist()} of one body are closer in its rest shape than the "
-                "distance within which contact acts, and would push it open; give a smaller distance"
+                "contact distance and would repel each other; give a smaller distance"
             )
 
 
 def _near(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, data: Any) -> Elements:
-    """Lists the pairs that come within h of each other between x and x + step.
+    """Lists the pairs that may come closer than h between x and x + step.
 
     The data of a slot are the two primitives, the number of its kind in `distances`, and whether it is used.
     """
@@ -176,7 +176,7 @@ def _near(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, data: A
         margin = parameters.distance / 2
         of_one = boxes(kind.one, x, x + step, margin)
         of_other = of_one if kind.one is kind.other else boxes(kind.other, x, x + step, margin)
-        # Boxes of neighbours in one surface always meet, so these lists are longer than those of near pairs.
+        # Boxes of neighbours in one surface always meet, so these lists are longer than the lists of near pairs.
         clusters, primitives = (count + count // 2 + 2 * capacity for count in kind.neighbours)
         pairs, used, overflow = pairs_near(kind.one, kind.other, of_one, of_other, (clusters, primitives))
         ends = jnp.asarray(kind.one.primitives)[pairs[:, 0]], jnp.asarray(kind.other.primitives)[pairs[:, 1]]
@@ -192,9 +192,9 @@ def _near(kinds: tuple[Kind, ...], capacity: int, x: Array, step: Array, data: A
 
 
 def _within_reach(x: Array, step: Array, corners: Array, number: np.ndarray, used: Array, distance: Array) -> Array:
-    """Whether pairs can come within a distance during a step, by their distance and the bound of their speed.
+    """Returns whether pairs can come within a distance during a step, from their distance and speed bound.
 
-    Measures only the used slots, which are a fraction of the list.
+    Measures only the used slots, a fraction of the list.
     """
     order = jnp.argsort(~used)
     kinds = jnp.asarray(number)
@@ -215,7 +215,7 @@ def _described(surface: Surface, x: Array, elements: Elements, data: Any) -> Pai
     one, other = pairs.T
     of_vertices, of_edges = areas(surface, rest)
     stencil = jax.vmap(stencil_of)(jax.lax.stop_gradient(x[elements.indices]), number)
-    # A pair of facets is counted from both sides: in space by vertices and by edges (Li et al. 2023, section 4).
+    # Both sides count a pair of facets: in space by vertices and by edges (Li et al. 2023, section 4).
     if surface.sides is None:
         area, parallel = of_vertices[one] / 2, jnp.zeros_like(rest, shape=one.shape)
     else:

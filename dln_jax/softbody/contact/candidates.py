@@ -1,11 +1,11 @@
-"""The contact surface of a body, and lists, of fixed capacity, of its primitives that may come near each other.
+"""The contact surface of a body, and lists of fixed capacity for primitives near each other.
 
 The facets of a quadratic mesh are divided at their mid-side nodes, into 2 edges in the plane and 4 triangles in space,
 so all nodes are in contact, on a surface that is linear between them.
 
-Primitives are grouped once into clusters of neighbours in the rest shape, which stay neighbours while the body deforms.
-The bounding boxes of clusters are compared first, then those of the primitives in clusters that meet. A list that is
-too short is reported, never silently cut off.
+Primitives are grouped once into clusters of neighbours in the rest shape; they stay neighbours as the body deforms. The
+bounding boxes of clusters are compared first, then the boxes of primitives in clusters that meet. A list that is too
+short is reported, never silently truncated.
 """
 
 import functools
@@ -23,7 +23,7 @@ from dln_jax.softbody.mesh.mesh import Mesh, boundary
 from dln_jax.softbody.mesh.surfaces import facet_nodes
 
 CLUSTER = 8
-"""Number of primitives that share one bounding box."""
+"""Number of primitives in one bounding box."""
 Boxes = tuple[Float[Array, "... dim"], Float[Array, "... dim"]]
 """Lowest and highest corners of bounding boxes, in m."""
 _PARTS = {3: ((0, 2), (2, 1)), 6: ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))}
@@ -106,7 +106,7 @@ def boxes(of: Group, x: Float[Array, "n dim"], end: Float[Array, "n dim"], margi
 def meeting(one: tuple[ArrayLike, ArrayLike], other: tuple[ArrayLike, ArrayLike]) -> Int[np.ndarray, "m 2"]:
     """Returns the pairs of known boxes (low, high) that meet, by rows of the first."""
     (low, high), (other_low, other_high) = (map(np.asarray, side) for side in (one, other))
-    # Boxes that meet have centres no farther apart than the halves of the longest sides, and rounding.
+    # The centres of boxes that meet are at most half of both longest sides apart, plus rounding.
     reach = (np.max(high - low) + np.max(other_high - other_low)) / 2 + 1e-12 * np.abs(other_high).max()
     trees = KDTree((low + high) / 2), KDTree((other_low + other_high) / 2)
     columns = trees[0].query_ball_tree(trees[1], reach, p=np.inf)
@@ -116,7 +116,7 @@ def meeting(one: tuple[ArrayLike, ArrayLike], other: tuple[ArrayLike, ArrayLike]
 
 
 def meetings(one: Group, other: Group, x: Float[np.ndarray, "n dim"], margin: float) -> tuple[int, int]:
-    """Counts the pairs of clusters and of primitives whose boxes, each enlarged by half the margin, meet at x."""
+    """Counts the cluster pairs and primitive pairs with boxes, each enlarged by half the margin, that meet at x."""
     at = jnp.asarray(x)
     first, second = (boxes(of, at, at, margin / 2) for of in (one, other))
     return len(meeting(_of_clusters(one, first), _of_clusters(other, second))), len(meeting(first, second))
@@ -125,7 +125,7 @@ def meetings(one: Group, other: Group, x: Float[np.ndarray, "n dim"], margin: fl
 def pairs_near(
     one: Group, other: Group, of_one: Boxes, of_other: Boxes, capacity: tuple[int, int]
 ) -> tuple[Int[Array, "capacity 2"], Bool[Array, " capacity"], Bool[Array, ""]]:
-    """Returns the pairs of primitives without a common vertex whose boxes meet, which slots are used, and overflow.
+    """Returns pairs of primitives with meeting boxes and no common vertex, the mask of used slots, and overflow.
 
     Args:
         one, other: the primitives; pairs within one group are listed once.
@@ -158,7 +158,7 @@ def _of_clusters(of: Group, box: Boxes) -> Boxes:
 
 
 def _meet(one: Boxes, other: Boxes) -> Bool[Array, "*batch one other"]:
-    """Whether boxes meet, for all pairs along their last batch axis."""
+    """Returns whether boxes meet, for all pairs along their last batch axis."""
     (low, high), (other_low, other_high) = one, other
     axes = range(low.shape[-1])
     before = [low[..., :, None, i] <= other_high[..., None, :, i] for i in axes]
@@ -167,7 +167,7 @@ def _meet(one: Boxes, other: Boxes) -> Bool[Array, "*batch one other"]:
 
 
 def places(mask: Bool[Array, "..."], capacity: int) -> tuple[Int[Array, " capacity"], Bool[Array, " capacity"], Array]:
-    """Returns the flat indices where the mask is true, which slots are used, and whether some had to be left out."""
+    """Returns the flat indices where the mask is true, the mask of used slots, and whether indices are missing."""
     # A binary search in the running counts of 32-bit words: several times faster than `nonzero`.
     flat = mask.reshape(-1)
     rows = jnp.pad(flat, (0, -len(flat) % 32)).reshape(-1, 32)
@@ -177,7 +177,7 @@ def places(mask: Bool[Array, "..."], capacity: int) -> tuple[Int[Array, " capaci
     number = jnp.arange(capacity, dtype=jnp.int32)
     used = number < running[-1]
     at = jnp.minimum(jnp.searchsorted(running, number, side="right"), len(words) - 1)
-    # The place in a word is the number of its beginnings that hold no more bits than the rank.
+    # The place in a word is the number of prefixes with no more bits than the rank.
     beginnings = words[at, None] & jnp.asarray(2 ** np.arange(1, 33) - 1, jnp.uint32)
     rank = number - running[at] + counts[at]
     held = jax.lax.population_count(beginnings).astype(jnp.int32)

@@ -1,6 +1,6 @@
-"""Exact test for crossing surfaces, and overlapping bodies: edges that cross in the plane, or triangles in space.
+"""Exact tests for crossing surfaces and overlapping bodies: crossing edges in the plane, triangles in space.
 
-Orientation determinants of float64 coordinates are evaluated in rational arithmetic where rounding could change a sign.
+Rational arithmetic evaluates orientation determinants of float64 coordinates where rounding could change a sign.
 """
 
 import itertools
@@ -17,11 +17,11 @@ from dln_jax.softbody.mesh.mesh import Mesh, components_of_vertices
 _ROUNDING = 1e-14
 """Rounding error of a determinant relative to the sum of the absolute values of its products: 20 units of rounding."""
 _AWAY = np.array([1.0, 0.618, 0.414])
-"""Direction of a ray out of a box, which passes through no vertex or edge of common meshes."""
+"""Direction of a ray out of a box; it avoids the vertices and edges of common meshes."""
 
 
 def crossings(mesh: Mesh, x: Float[np.ndarray, "n dim"]) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """Returns the pairs of boundary primitives that have a common point at positions x, by their vertices.
+    """Returns the pairs of boundary primitives with a common point at positions x, by their vertices.
 
     Pairs are two edges in the plane, an edge and a triangle in space; pairs with a common vertex are left out. If two
     triangles in space cross, an edge of one crosses the other.
@@ -58,7 +58,7 @@ def count_overlaps(mesh: Mesh) -> Callable[[Float[np.ndarray, "n dim"]], int] | 
 def _crossing(
     x: Float[np.ndarray, "n dim"], edges: Int[np.ndarray, "e 2"], facets: Int[np.ndarray, "f dim"]
 ) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """Returns the edges and facets that have a common point, but no common vertex; pairs of edges once."""
+    """Returns the edges and facets with a common point but no common vertex; each pair of edges once."""
     one, other = meeting(*((x[of].min(axis=1), x[of].max(axis=1)) for of in (edges, facets))).T
     if x.shape[1] == 2:
         one, other = one[one < other], other[one < other]
@@ -70,10 +70,10 @@ def _crossing(
 
 
 def _segments_meet(one: Float[np.ndarray, "m 2 2"], other: Float[np.ndarray, "m 2 2"]) -> Bool[np.ndarray, " m"]:
-    """Whether segments in the plane have a common point."""
+    """Returns whether segments in the plane have a common point."""
     (a, b), (c, d) = one.swapaxes(0, 1), other.swapaxes(0, 1)
     of_other, of_one = _sides(a, b, c) * _sides(a, b, d), _sides(c, d, a) * _sides(c, d, b)
-    # Collinear segments meet exactly if their boxes do; other segments with a common point have boxes that meet.
+    # Collinear segments meet exactly if their boxes meet; other segments can only meet if their boxes meet.
     boxes_meet = (one.min(axis=1) <= other.max(axis=1)) & (other.min(axis=1) <= one.max(axis=1))
     return (of_other <= 0) & (of_one <= 0) & boxes_meet.all(axis=1)
 
@@ -81,7 +81,7 @@ def _segments_meet(one: Float[np.ndarray, "m 2 2"], other: Float[np.ndarray, "m 
 def _segments_meet_triangles(
     edges: Float[np.ndarray, "m 2 3"], triangles: Float[np.ndarray, "m 3 3"]
 ) -> Bool[np.ndarray, " m"]:
-    """Whether segments in space meet triangles."""
+    """Returns whether segments in space meet triangles."""
     (p, q), (a, b, c) = edges.swapaxes(0, 1), triangles.swapaxes(0, 1)
     start, end = _sides(a, b, c, p), _sides(a, b, c, q)
     flat = (start == 0) & (end == 0)
@@ -94,7 +94,7 @@ def _segments_meet_triangles(
 
 
 def _meet_in_plane(edges: np.ndarray, triangles: np.ndarray) -> Bool[np.ndarray, " m"]:
-    """Whether segments in the plane of a triangle meet it, projected along the largest component of its normal."""
+    """Returns whether segments in a triangle's plane meet it, projected along the largest component of its normal."""
     a, b, c = triangles.swapaxes(0, 1)
     axis = np.argmax(np.abs(np.cross(b - a, c - a)), axis=1)
     kept = np.array([[1, 2], [0, 2], [0, 1]])[axis][:, None, :]
@@ -107,11 +107,11 @@ def _meet_in_plane(edges: np.ndarray, triangles: np.ndarray) -> Bool[np.ndarray,
 
 
 def _sides(*points: Float[np.ndarray, "m dim"]) -> Int[np.ndarray, " m"]:
-    """Signs of the orientations of dim + 1 points."""
+    """Returns the signs of the orientations of dim + 1 points."""
     rows = np.stack([point - points[0] for point in points[1:]], axis=1)
     value, size = _determinants(rows)
     signs = np.sign(value).astype(int)
-    # Differences of equal coordinates are exactly zero, and so is a determinant whose products all vanish.
+    # Differences of equal coordinates are exactly zero, and so is a determinant of vanishing products.
     for number in np.flatnonzero((np.abs(value) <= _ROUNDING * size) & (size > 0)):
         first, *others = ([Fraction(float(u)) for u in point[number]] for point in points)
         exact, _ = _determinants(np.array([[np.subtract(other, first) for other in others]], dtype=object))

@@ -3,18 +3,18 @@
     D = |delta|²,  delta = w - s_1 e_1 - s_2 e_2,  s = argmin D = G⁻¹ (e_i·w),  G_ij = e_i·e_j
 
 w joins a point of one primitive to a point of the other, and e_1, e_2 span the closest features: both for the interior
-of a triangle or of two edges, one for a point and an edge, none for two points. A `Stencil` states w and e as
-combinations of the vertices, so that one program serves all pairs. Comparisons, without derivatives, decide which
-features are closest; D is once continuously differentiable where they change (Li et al. 2020, section 3.2). With beta
-the weights of the vertices in delta and c_i those in e_i, the derivatives are
+of a triangle or of two edges, one for a point and an edge, none for two points. A `Stencil` holds w and e as
+combinations of the vertices, so one program serves all pairs. Comparisons, without derivatives, select the closest
+features; D is once continuously differentiable where they change (Li et al. 2020, section 3.2). With the weights beta
+of the vertices in delta, and c_i in e_i, the derivatives are
 
     dD/dx = 2 beta (x) delta,    d²D/dx² = 2 beta betaᵀ (x) I - 2 A G⁻¹ Aᵀ,    A_i = beta (x) e_i + c_i (x) delta.
 
-Conservative continuous collision detection tells how far vertices may move until a pair nearly touches.
-Additive advancement (Li, Kaufman, Jiang 2021, Codimensional Incremental Potential Contact, section 5): with the speed
-bound l = max |p_i| + max |p_j| over the vertices of the two primitives (relative to their mean motion), the distance
-after a time t is at least d - t l. Time advances by such bounds until the distance has shrunk to a fraction of its
-initial value. The result never overestimates, apart from rounding, which is smaller than the remaining distance.
+Conservative continuous collision detection limits the motion of vertices before a pair touches. Additive advancement
+(Li, Kaufman, Jiang 2021, Codimensional Incremental Potential Contact, section 5): with the speed bound l = max |p_i| +
+max |p_j| over the vertices of the two primitives (relative to their mean motion), the distance after a time t is at
+least d - t l. Time advances by such bounds until the distance has shrunk to a fraction of its initial value. The result
+never overestimates beyond rounding, which is smaller than the remaining distance.
 """
 
 import functools
@@ -29,10 +29,10 @@ from jaxtyping import Array, Float, Int
 POINT_TRIANGLE, EDGE_EDGE = 0, 1
 """Kinds of pairs in space: (p, a, b, c), and (a, b, c, d) with edges from a to b and from c to d. The plane has one
 kind: a point and an edge, (p, a, b)."""
-# Two directions whose squared sine is below this count as parallel; their closest points are sought on the boundary.
+# Directions with a smaller squared sine count as parallel; the search for their closest points is on the boundary.
 _PARALLEL = 1e-20
 REMAINING = 0.1
-"""Fraction of its distance that a pair keeps in one step."""
+"""Smallest fraction of a pair's distance that remains after one step."""
 _ADVANCE = 0.9
 _ITERATIONS = 200
 
@@ -74,7 +74,7 @@ def squared_distance(x: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Fl
 
 
 def summed(values: Array, axis: int = -1) -> Array:
-    """Returns the sum over a short axis, written out: XLA fuses it, but compiles a reduction as a separate loop."""
+    """Returns the sum over a short axis, unrolled: XLA fuses it, but compiles a reduction as a separate loop."""
     parts = [jax.lax.index_in_dim(values, i, axis, keepdims=False) for i in range(values.shape[axis])]
     return functools.reduce(jnp.add, parts)
 
@@ -100,7 +100,8 @@ def stencil_of(x: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Stencil:
 
 
 def _inside(w: Array, e: Array, f: Array, kind: Int[Array, ""] | int) -> Array:
-    """Whether |w - s e - t f| is smallest inside a triangle (s, t >= 0, s + t <= 1) or inside two edges (s, t <= 1)."""
+    """Tests if |w - s e - t f| is smallest inside a triangle (s, t >= 0, s + t <= 1) or inside two edges (s, t <=
+    1)."""
     ee, ef, ff, ew, fw = (summed(u * v) for u, v in ((e, e), (e, f), (f, f), (e, w), (f, w)))
     determinant = ee * ff - ef**2
     s, t = ff * ew - ef * fw, ee * fw - ef * ew
@@ -109,12 +110,12 @@ def _inside(w: Array, e: Array, f: Array, kind: Int[Array, ""] | int) -> Array:
 
 
 def _combined(weights: Float[Array, "*rows k"], x: Float[Array, "k dim"]) -> Float[Array, "*rows dim"]:
-    # A sum instead of a matrix product, which would round to fewer digits on a GPU.
+    # A sum, because a matrix product rounds to fewer digits on a GPU.
     return summed(weights[..., None] * x, axis=-2)
 
 
 def speed_bound(p: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Float[Array, ""]:
-    """Returns l in m per unit of time for one pair whose vertices move by p; kinds are those of `distances`."""
+    """Returns l in m per unit of time for one pair with vertex motions p; kinds as in `distances`."""
     speed = jnp.sqrt(summed((p - summed(p, axis=0) / len(p)) ** 2))
     first = jnp.arange(len(p)) < jnp.where((kind == EDGE_EDGE) & (len(p) == 4), 2, 1)
     return jnp.max(jnp.where(first, speed, 0)) + jnp.max(jnp.where(first, 0, speed))
@@ -123,7 +124,7 @@ def speed_bound(p: Float[Array, "k dim"], kind: Int[Array, ""] | int) -> Float[A
 def longest_step(
     distance: Callable[[Float[Array, " lanes"]], Float[Array, " lanes"]], bound: Float[Array, " lanes"]
 ) -> Float[Array, ""]:
-    """Returns the largest t <= 1 up to which no lane has lost more than 1 - `REMAINING` of its distance.
+    """Returns the largest t <= 1 before a lane has lost more than 1 - `REMAINING` of its distance.
 
     Args:
         distance: one time per lane -> distances in m.
@@ -131,7 +132,7 @@ def longest_step(
     """
     start = distance(jnp.zeros_like(bound))
     target = REMAINING * start
-    # The other lanes keep enough distance however they move.
+    # The other lanes keep enough distance in any motion.
     moving = bound > start - target
     rate = jnp.where(moving, bound, 1.0)
 
@@ -146,7 +147,7 @@ def longest_step(
         limit = jnp.min(jnp.where(active & reached, t, limit), initial=1.0)
         active &= ~reached
         t = jnp.where(active, t + _ADVANCE * jnp.maximum(now - target, 0) / rate, t)
-        # A lane beyond the earliest stop of another lane cannot shorten the step.
+        # A lane past the earliest stop of another lane cannot shorten the step.
         return t, active & (t < limit), limit, count + 1
 
     one = jnp.ones((), start.dtype)

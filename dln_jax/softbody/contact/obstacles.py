@@ -3,8 +3,8 @@
     E = kappa A b(d²) / h³
 
 with the signed distance d of a vertex to the obstacle, positive outside, and b of `barrier`. The distance limits the
-steps of the minimisation, so that no vertex enters an obstacle, however fast it is. Only vertices are in contact: an
-obstacle smaller than the triangles of a body can pass between them. Model it as a held body in a `body_contact`.
+steps of the minimisation, so no vertex enters an obstacle at any speed. Only vertices are in contact: an obstacle
+smaller than the triangles of a body can pass between the vertices. Model it as a held body in a `body_contact`.
 
 An obstacle is a NamedTuple of differentiable arrays with a method `distance`: position in m -> signed distance in m. It
 must not overestimate the distance (its slope is at most 1) and must be twice differentiable almost everywhere outside
@@ -56,7 +56,7 @@ class Capsule(NamedTuple):
 
     @property
     def pose(self) -> Pose:
-        """The segment, which does not spin about itself."""
+        """The segment, without spin about its axis."""
         along = self.end - self.start
         squared = jnp.sum(along**2)
         return self.start, along[None] / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
@@ -70,7 +70,7 @@ class Capsule(NamedTuple):
 
 
 class Box(NamedTuple):
-    """A box whose sides point along the rows of a rotation."""
+    """A box with sides along the rows of a rotation."""
 
     centre: Float[Array, " dim"]
     half_lengths: Float[Array, " dim"]
@@ -103,12 +103,13 @@ class Heightfield(NamedTuple):
 
     @property
     def pose(self) -> Pose:
-        """The ground shifts with its lattice; changes of heights do not move it along itself."""
+        """The ground shifts with its lattice; changes of heights cause no tangential motion."""
         origin = jnp.pad(self.origin, (0, 1))
         return origin, jnp.zeros((0, len(origin)), origin.dtype)
 
     def distance(self, x: Array) -> Array:
-        """At most the true distance: the height over sqrt(1 + s²), s the largest slope of the control points."""
+        """Lower bound of the true distance: the height over sqrt(1 + s²), with the largest slope s of the control
+        points."""
         at = (x[:-1] - self.origin) / self.spacing
         ground = self.heights
         for axis in range(ground.ndim - 1, -1, -1):
@@ -161,15 +162,15 @@ def obstacle_contact(
     threshold_speed: float = 1e-3,
     name: str = "obstacle",
 ) -> Contact:
-    """Contact of the boundary's vertices with an obstacle; the other arguments are those of `body_contact`.
+    """Contact of the boundary's vertices with an obstacle; other arguments as for `body_contact`.
 
     Raises:
-        InputError: a number is not positive, a vertex is inside the obstacle in the rest shape, or friction is asked of
-            a shape without a pose.
+        InputError: a number is not positive, a vertex is inside the obstacle in the rest shape, or a shape with
+            friction has no pose.
     """
     require_positive(distance=distance, threshold_speed=threshold_speed)
     if friction is not None and not hasattr(obstacle, "pose"):
-        raise InputError(f"the obstacle '{name}' has no property `pose`, which friction needs")
+        raise InputError(f"the obstacle '{name}' has no property `pose`; friction needs one")
     surface = surface_of(mesh)
     parameters = contact_parameters(distance, stiffness, friction, obstacle)
     distances = jax.vmap(type(obstacle).distance, (None, 0))
@@ -193,7 +194,7 @@ def obstacle_contact(
     def energy(x: Float[Array, "1 dim"], data: tuple[Any, Array, Array]) -> Float[Array, ""]:
         shape, strength, near = data
         d = shape.distance(x[0])
-        # Inside the obstacle the energy is infinite, so that no step is accepted there.
+        # Inside the obstacle the energy is infinite, so no step ends there.
         return jnp.where(d > 0, strength * barrier(d**2, near)[0], jnp.inf)
 
     def longest(x: Array, step: Array, elements: Elements, data: tuple[ContactParameters, Array]) -> Array:
@@ -230,7 +231,7 @@ def obstacle_contact(
 
 
 def _spline(values: Float[Array, "*outer k"], at: Float[Array, ""]) -> Float[Array, "*outer"]:
-    """Value of the uniform cubic B-spline along the last axis; constant beyond the ends."""
+    """Returns the uniform cubic B-spline along the last axis; constant beyond the ends."""
     last = values.shape[-1] - 1
     at = jnp.clip(at, 0.0, last)
     first = jnp.clip(jnp.floor(at), 0, max(last - 1, 0))

@@ -1,8 +1,8 @@
 """Mesh files: .msh of Gmsh by `mesh/gmsh.py`; .vtk, .vtu, .obj and TetGen's .ele and .node by meshio (extra `[mesh]`).
 
-VTK has no sets, so integer arrays name them. An array of 0 and 1, as `write_mesh` writes, marks the members of the set
-of that name. An array with up to `MOST_REGIONS` different numbers gives sets NAME-0, NAME-1, ... meshio's own
-conversion of its sets, with names joined by hyphens, is read as well.
+VTK has no sets, so integer arrays define them. An array of 0 and 1, as written by `write_mesh`, marks the members of
+the set with its name. An array with up to `MOST_REGIONS` different numbers gives sets NAME-0, NAME-1, ... Arrays from
+meshio's own conversion of sets, with names joined by hyphens, are read too.
 """
 
 import contextlib
@@ -25,14 +25,14 @@ from dln_jax.types import InputError, require_positive
 
 SUFFIXES = (".msh", ".vtk", ".vtu", ".obj", ".ele", ".node")
 QUADRATIC = {2: "triangle6", 3: "tetra10"}
-"""Quadratic cells by dimension, in meshio's names; their nodes have VTK's order, as in `Mesh.nodes`."""
+"""Quadratic cells by dimension, in meshio's names, with nodes in VTK's order, as in `Mesh.nodes`."""
 MOST_REGIONS = 64
-"""An integer array with more different numbers is a numbering, not a set of regions."""
+"""An integer array with more different numbers is a numbering and defines no regions."""
 INSTALL = "pip install 'dln-jax[mesh]'"
 
 
 def read_mesh(path: str | Path, *, scale: float = 1.0, merge: float = MERGE) -> ReadMesh:
-    """Reads the body in a mesh file, with its named sets, and states what was left out or repaired.
+    """Reads the body in a mesh file with its named sets, and reports omissions and repairs.
 
     Args:
         path: a .msh (2.2 or 4.1, ASCII or binary), .vtk, .vtu, .obj, .ele or .node file.
@@ -77,7 +77,7 @@ def write_mesh(
     vertices = {
         name: _flags(n, part.vertices)
         for name, part in mesh.sets.items()
-        # A set that has exactly the nodes of its elements needs no vertex array.
+        # A set of exactly the nodes of its elements needs no vertex array.
         if not len(part.elements) or not np.array_equal(part.vertices, np.unique(mesh.nodes[part.elements]))
     }
     elements = {name: _flags(m, part.elements) for name, part in mesh.sets.items() if len(part.elements)}
@@ -157,7 +157,7 @@ def _read_by_meshio(path: Path) -> FileMesh:
     meshio = require_meshio(f"reading {path.suffix} files")
     printed = io.StringIO()
     try:
-        # meshio prints, and exits the process, if it cannot read a file.
+        # If meshio cannot read a file, it prints and exits the process.
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
             content = meshio.read(path)
         points = np.asarray(content.points, np.float64)
@@ -183,7 +183,7 @@ def _read_by_meshio(path: Path) -> FileMesh:
 
 
 def _sets(key: str, values: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Yields names and members of the sets in an array of a VTK file; none if it does not hold integers."""
+    """Yields names and members of the sets in an array of a VTK file; nothing for other types than integers."""
     if values.dtype.kind not in "iu" or values.ndim != 1 or not len(values):
         return
     numbers, names = np.unique(values), _joined_names(key)
@@ -198,7 +198,7 @@ def _sets(key: str, values: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _joined_names(key: str) -> list[str]:
-    """Splits an array's name into the names of meshio's sets: joined by hyphens or, for points, by the joined names."""
+    """Splits an array's name into the names of meshio's sets, joined by hyphens."""
     parts = key.split("-")
     count = math.isqrt(len(parts) - 1) + 1
     names = [parts[0][: len(parts[0]) // 2], *parts[1 : count - 1], parts[-1][: len(parts[-1]) // 2]]

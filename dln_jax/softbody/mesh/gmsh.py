@@ -1,8 +1,8 @@
 """Reads .msh files of Gmsh, versions 2.2 and 4.1, ASCII and binary, with all their physical groups.
 
 The format is described in https://gmsh.info/doc/texinfo/gmsh.html#MSH-file-format. meshio 5 refuses files with elements
-in no physical group (`Mesh.SaveAll`) or with parametric node coordinates, and keeps one group of an element that is in
-several; this reader accepts all of them.
+in no physical group (`Mesh.SaveAll`) or with parametric node coordinates, and keeps only one of several groups of an
+element. This reader accepts all of these.
 """
 
 import re
@@ -17,7 +17,7 @@ from dln_jax.types import InputError
 Take = Callable[[str, Any], np.ndarray]
 """(type, count) -> the next numbers of a section."""
 _Block = tuple[str, np.ndarray, tuple[str, ...]]
-"""Kind and nodes of cells that are in the same physical groups, and these groups."""
+"""Kind and nodes of cells with the same physical groups, and these groups."""
 
 KINDS = {
     1: "line2",
@@ -53,7 +53,7 @@ KINDS = {
 }
 """Kind of cell by Gmsh's number, and number of its nodes at the end."""
 GEOMETRY = ("point", "curve", "surface", "volume")
-"""Physical groups without a name get these names and their number, such as surface-3."""
+"""Names of unnamed physical groups, completed by their number, such as surface-3."""
 
 
 def read_gmsh(data: bytes) -> FileMesh:
@@ -134,7 +134,7 @@ def _sections(data: bytes) -> Iterator[tuple[str, bytes]]:
 
 
 def _reader(section: bytes, types: dict[str, str] | None) -> Take:
-    """Returns a function that reads one number after another: of these types in NumPy's words, or as text."""
+    """Returns a function that reads numbers in order, of these NumPy types or as text."""
     numbers = np.fromiter(map(float, section.split() if types is None else ()), np.float64)
     at = 0
 
@@ -184,7 +184,7 @@ def _nodes(take: Take) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _elements(take: Take, groups: dict[tuple[int, int], tuple[str, ...]]) -> Iterator[_Block]:
-    """Yields elements of version 4.1, which have the groups of their entity."""
+    """Yields elements of version 4.1, with the groups of their entity."""
     for _ in range(take("n", 4)[0]):
         dimension, tag, number = take("i", 3)
         kind, nodes = _kind(number)
@@ -204,13 +204,14 @@ def _nodes_2(section: bytes, types: dict[str, str] | None) -> tuple[np.ndarray, 
 
 
 def _elements_2(section: bytes, types: dict[str, str] | None, names: dict[tuple[int, int], str]) -> Iterator[_Block]:
-    """Yields elements of version 2.2: the first tag of an element is its group, and every group lists it once."""
+    """Yields elements of version 2.2: the first tag of an element is its group, and the element appears once per
+    group."""
     count, _, content = section.partition(b"\n")
     take, binary = _reader(content, types), types is not None
     tables: dict[tuple[int, int], list[np.ndarray]] = {}
     read = 0
     while read < int(count):
-        # ASCII states kind and number of tags for every element (number, kind, tags), binary for a block of elements.
+        # ASCII has kind and number of tags for every element (number, kind, tags), binary for a block of elements.
         number, block, tags = map(int, take("i", 3)[slice(None) if binary else [1, 0, 2]])
         if tags < 0:
             raise ValueError("an element has a negative number of tags")

@@ -1,7 +1,7 @@
 """Meshes of simplices: triangles in the plane, tetrahedra in space.
 
-Meshes are static NumPy arrays in float64, which become constants of the compiled simulation. A body in the plane is
-1 m thick: its areas in m² count as volumes in m³. `mesh/simplices.py` has volumes differentiable by the rest shape.
+Meshes are static NumPy arrays in float64, constants of the compiled simulation. A body in the plane is 1 m thick: its
+areas in m² count as volumes in m³. For volumes that are differentiable by the rest shape, see `mesh/simplices.py`.
 """
 
 import itertools
@@ -17,7 +17,7 @@ from dln_jax.softbody.mesh.simplices import connected, facets, regularity, simpl
 from dln_jax.types import InputError
 
 FLAT = 1e-12
-"""An element is degenerate up to this `regularity`: its volume is rounding error."""
+"""Elements up to this `regularity` are degenerate: their volume is a rounding error."""
 _CORNER_SHARES = {2: 1 / 19, 3: 1 / 36}
 """Share of a quadratic element's mass at one corner (Hinton, Rock and Zienkiewicz 1976): in proportion to the diagonal
 of the consistent mass matrix, which is 6 at a corner and 32 in the middle of a side. All shares are positive."""
@@ -41,7 +41,7 @@ class Mesh(NamedTuple):
     elements: Int[np.ndarray, "m corners"]
     """Corners of the triangles (dim 2) or tetrahedra (dim 3), positively oriented."""
     turned: int = 0
-    """Number of inverted elements (clockwise in the plane) that `make_mesh` has reoriented."""
+    """Number of inverted elements (clockwise in the plane) reoriented by `make_mesh`."""
     sets: Mapping[str, NamedSet] = MappingProxyType({})
     """Named parts from a mesh file."""
     midsides: Int[np.ndarray, "m edges"] | None = None
@@ -64,9 +64,9 @@ def make_mesh(vertices: ArrayLike, elements: ArrayLike) -> Mesh:
     `Mesh.turned` counts the reoriented elements. Elements may overlap: their energies add up; `overlaps` finds them.
 
     Raises:
-        InputError: names the first invalid vertex or element: a position that is not finite, a corner out of range or
-            repeated, a duplicate or degenerate element, a vertex in no element. Also if elements share no vertices
-            although some of their corners coincide: the vertices of such a mesh were never merged.
+        InputError: a position is not finite, a corner is out of range or repeated, an element is a duplicate or
+            degenerate, or a vertex belongs to no element; the message names the first one. Also if no two elements
+            share a vertex although corners coincide, because the vertices were never merged.
     """
     positions = _as_array("vertices", vertices)
     if positions.dtype.kind not in "iuf":
@@ -96,7 +96,7 @@ def volumes(mesh: Mesh) -> Float[np.ndarray, " m"]:
 
 
 def boundary(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
-    """Returns the facets with the body on one side only, oriented outwards.
+    """Returns the boundary facets, with the body on one side only, oriented outwards.
 
     An edge [a, b] in the plane has the body on its left and the outward normal (yb - ya, xa - xb). A triangle [a, b, c]
     in space has the outward normal (b - a) x (c - a).
@@ -106,7 +106,7 @@ def boundary(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
 
 
 def overlaps(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
-    """Returns facets with two or more elements on one side, which overlap: their masses and stiffnesses add up.
+    """Returns facets with overlapping elements on one side, where masses and stiffnesses add up.
 
     Overlaps of elements without a common facet are not detected.
     """
@@ -147,10 +147,10 @@ def components_of_vertices(mesh: Mesh) -> Int[np.ndarray, " n"]:
 
 
 def vertices_where(mesh: Mesh, condition: Callable[[Float[np.ndarray, "n dim"]], np.ndarray]) -> Int[np.ndarray, " k"]:
-    """Returns the vertices whose rest positions [n, dim] satisfy a condition, such as `lambda x: x[:, 0] < 1e-9`.
+    """Returns the vertices with rest positions [n, dim] that satisfy a condition, such as `lambda x: x[:, 0] < 1e-9`.
 
     Raises:
-        InputError: no vertex does, or the condition does not return one boolean per vertex.
+        InputError: no vertex satisfies it, or the condition does not return one boolean per vertex.
     """
     chosen = np.asarray(condition(mesh.vertices))
     if chosen.shape != (len(mesh.vertices),) or chosen.dtype != bool:
@@ -165,10 +165,10 @@ def vertices_where(mesh: Mesh, condition: Callable[[Float[np.ndarray, "n dim"]],
 
 
 def vertices_in(mesh: Mesh, names: Iterable[str]) -> Int[np.ndarray, " k"]:
-    """Returns the vertices that are in any of these sets, in ascending order, for example for `held`.
+    """Returns the vertices in any of these sets, in ascending order, for example for `held`.
 
     Raises:
-        InputError: a set does not exist (the message lists those that do), or has no vertices.
+        InputError: a set does not exist (the message lists the existing sets), or has no vertices.
     """
     members = [np.zeros(0, np.int64)]
     for name in names:
@@ -181,7 +181,7 @@ def vertices_in(mesh: Mesh, names: Iterable[str]) -> Int[np.ndarray, " k"]:
 
 
 def values_by_set(mesh: Mesh, default: float, values: Mapping[str, float]) -> Float[np.ndarray, " m"]:
-    """Returns one value per element, such as Young's modulus: that of its set, or the default outside these sets.
+    """Returns one value per element, such as Young's modulus: the value of its set, or the default.
 
     An element in several of these sets gets the value of the last one.
 
@@ -207,14 +207,15 @@ def lumped_masses(mesh: Mesh, density: int | float | ArrayLike) -> Float[np.ndar
     """Returns the masses of the vertices in kg: an element's corners get equal shares of its mass.
 
     In a quadratic element, each mid-side node gets 16/3 of a corner's share. These masses integrate linear functions
-    exactly, so results with body forces converge with order 2 instead of the elements' order 3.
+    exactly, so results with body forces converge with order 2 instead of order 3.
 
     Args:
         mesh: positions in m.
         density: in kg/m³ (in the plane for 1 m of thickness), one for all elements or one per element, [m].
 
     Raises:
-        InputError: a density is not positive and finite, or the number of densities differs from that of the elements.
+        InputError: a density is not positive and finite, or the number of densities differs from the number of
+            elements.
     """
     densities = np.asarray(density, dtype=np.float64)
     m = len(mesh.elements)
@@ -235,10 +236,11 @@ def lumped_masses(mesh: Mesh, density: int | float | ArrayLike) -> Float[np.ndar
 
 
 def _facet_sides(mesh: Mesh) -> tuple[Int[np.ndarray, "f dim"], Int[np.ndarray, "f 2"]]:
-    """Returns the distinct facets, oriented as in their first element, and how many elements lie on their two sides."""
+    """Returns the distinct facets, oriented as in their first element, and the numbers of elements on their two
+    sides."""
     every = facets(mesh.elements).reshape(-1, mesh.dimension)
     _, first, group = np.unique(np.sort(every, axis=1), axis=0, return_index=True, return_inverse=True)
-    # The sign of the permutation that sorts a facet's corners tells on which side its element lies.
+    # The sign of the permutation that sorts a facet's corners gives the side of its element.
     swaps = sum(every[:, i] > every[:, j] for i, j in itertools.combinations(range(mesh.dimension), 2))
     counts = np.bincount(2 * group.reshape(-1) + swaps % 2, minlength=2 * len(first)).reshape(-1, 2)
     order = np.argsort(first)
@@ -246,7 +248,7 @@ def _facet_sides(mesh: Mesh) -> tuple[Int[np.ndarray, "f dim"], Int[np.ndarray, 
 
 
 def _require_elements(vertices: np.ndarray, elements: np.ndarray) -> Float[np.ndarray, " m"]:
-    """Returns the elements' `regularity`; refuses elements that are wrong, and vertices without a second element."""
+    """Returns the elements' `regularity`; refuses invalid elements and dangling vertices."""
     n = len(vertices)
     if (bad := np.flatnonzero(((elements < 0) | (elements >= n)).any(axis=1))).size:
         corners = elements[bad[0]]
@@ -272,7 +274,7 @@ def _require_elements(vertices: np.ndarray, elements: np.ndarray) -> Float[np.nd
     if (bad := np.flatnonzero(np.abs(shape) <= FLAT)).size:
         raise InputError(
             f"element {bad[0]} is degenerate: the {measure} of {kind} {elements[bad[0]].tolist()} is "
-            f"{shape[bad[0]]:.1e} of a regular one's; expected more than {FLAT:.0e}; "
+            f"{shape[bad[0]]:.1e} of a regular {kind}'s; expected more than {FLAT:.0e}; "
             f"leave it out, merge its corners or move one{_others(bad)}"
         )
     uses = np.bincount(elements.ravel(), minlength=n)
@@ -282,7 +284,7 @@ def _require_elements(vertices: np.ndarray, elements: np.ndarray) -> Float[np.nd
         )
     if uses.max() == 1 and (distinct := len(np.unique(vertices, axis=0))) < n:
         raise InputError(
-            f"no two of the {len(elements)} elements share a vertex, so that each would move alone; "
+            f"no two of the {len(elements)} elements share a vertex, so each would move alone; "
             f"the {n} vertices have {distinct} distinct positions: merge those at the same position"
         )
     return shape

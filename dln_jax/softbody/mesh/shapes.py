@@ -1,11 +1,11 @@
-"""Meshes of simple shapes, and meshes made from others.
+"""Meshes of simple shapes, and transformations of meshes.
 
-Shapes are beam, box, disc, any set of lattice cells, and creatures with muscles along their skin. Others are joined,
-moved to their places, split, or made quadratic.
+The shapes are beam, box, disc, any set of lattice cells, and creatures with muscles along their skin. Meshes can be
+joined, moved, split, or made quadratic.
 
-A creature stands on y = 0 and faces right. It is drawn in square cells (`#`), with two triangles per cell, and pointed
-ends (`<`, `>`). All edges of the outline except those on the ground are muscles: on both sides of the legs, to bend
-them, and on the upper and lower side of the body. Sizes suit the "creature" preset, with energies per triangle.
+A creature stands on y = 0 and faces right. A drawing defines its square cells (`#`), with two triangles per cell, and
+its pointed ends (`<`, `>`). All edges of the outline except those on the ground are muscles: on both sides of the legs,
+to bend them, and on the upper and lower side of the body. Sizes suit the "creature" preset, with energies per triangle.
 """
 
 import itertools
@@ -26,7 +26,7 @@ from dln_jax.types import InputError, finite_array, require_positive
 # Lattice cells are cut so that every diagonal joins two vertices with an even sum of coordinates: neighbours are mirror
 # images, so they fit, and no direction is preferred. In space a cell is one regular tetrahedron between four alternate
 # corners and one tetrahedron in each of the other four. The alternative, six equal tetrahedra around a space diagonal
-# (Kuhn), costs a fifth more elements, has flatter ones, and a bent bar twists towards its diagonals.
+# (Kuhn), takes a fifth more elements, which are flatter, and a bent bar twists towards its diagonals.
 PATTERNS = {
     2: (((0, 0), (1, 0), (1, 1)), ((0, 0), (1, 1), (0, 1))),
     3: (
@@ -87,7 +87,7 @@ def disc(radius: float, rings: int) -> Mesh:
 def lattice(cells: ArrayLike) -> tuple[Int[np.ndarray, "n dim"], Int[np.ndarray, "m corners"]]:
     """Returns integer positions and positively oriented elements of the unit cells with these lower corners [c, dim].
 
-    Vertices are in lexicographic order. Any set of cells will do; scale the positions and pass both to `make_mesh`.
+    Vertices are in lexicographic order. Any set of cells works; scale the positions and pass both to `make_mesh`.
     """
     lower = np.asarray(cells, dtype=np.int64)
     pattern = np.array(PATTERNS[lower.shape[1]])
@@ -142,7 +142,7 @@ def body_length(creature: Creature) -> float:
 
 
 def _drawn(name: str, size: float, *rows: str) -> Creature:
-    """Builds the creature of a drawing whose cells have sides of `size` m."""
+    """Builds the creature of a drawing with cells of `size` m."""
     drawing = {(x, y): mark for y, row in enumerate(reversed(rows)) for x, mark in enumerate(row)}
     positions, elements = lattice([cell for cell, mark in drawing.items() if mark == "#"])
     number = {tuple(position): index for index, position in enumerate(positions.tolist())}
@@ -172,12 +172,12 @@ def _grid(lengths: tuple[float, ...], cells: tuple[int, ...]) -> Mesh:
 
 
 def _on_ring(k: int, place: int) -> int:
-    """Index of the vertex at a position on ring k, modulo the ring."""
+    """Returns the index of the vertex at a position on ring k, modulo the ring."""
     return 0 if k == 0 else 1 + 3 * k * (k - 1) + place % (6 * k)
 
 
 def _require_room(elements: int) -> None:
-    # Estimated, not measured: vertices, derivatives, blocks of the Hessian and its factor.
+    # Estimate for vertices, derivatives, blocks of the Hessian and its factor.
     require_memory(f"a mesh of {elements:,} elements", 4096.0 * elements)
 
 
@@ -189,19 +189,19 @@ def _require_sizes(**sizes: int | float) -> None:
 
 
 def join(*meshes: Mesh, **bodies: Mesh) -> Mesh:
-    """Returns one mesh of several bodies, which share no vertices: `join(floor, left=pad, right=pad)`.
+    """Returns one mesh of several bodies without common vertices: `join(floor, left=pad, right=pad)`.
 
-    Named sets are kept, and sets of one name are united. A body given by name becomes a set of that name, for example
-    to give it a material of its own (`values_by_set`).
+    Named sets are kept; sets with the same name are merged. A body passed by name becomes a set with this name, for
+    example to give it its own material (`values_by_set`).
 
     Raises:
-        InputError: there is no mesh, or some are planar and others in space, or linear and quadratic.
+        InputError: there is no mesh, or the meshes mix plane and space, or linear and quadratic elements.
     """
     for name, mesh in bodies.items():
         whole = NamedSet(np.arange(len(mesh.vertices)), np.arange(len(mesh.elements)))
         meshes += (mesh._replace(sets={**mesh.sets, name: whole}),)
     if len({(mesh.dimension, mesh.midsides is None) for mesh in meshes}) != 1:
-        raise InputError("the meshes differ in dimension or order of their elements, or there is none; join alike ones")
+        raise InputError("there is no mesh, or the meshes differ in dimension or order; join meshes of the same kind")
     starts = [0, *itertools.accumulate(len(mesh.vertices) for mesh in meshes)]
     sets: dict[str, NamedSet] = {}
     elements = 0
@@ -245,9 +245,9 @@ def rotate(mesh: Mesh, rotation: ArrayLike, *, about: ArrayLike | None = None) -
 def quadratic(mesh: Mesh) -> Mesh:
     """Adds a node in the middle of every edge: triangles of 6 nodes and tetrahedra of 10.
 
-    The new vertices follow those of the mesh, whose corners keep their indices; named sets are extended by
-    `with_midsides`. Edges are straight; for a curved rest shape, move vertices by `mesh._replace(vertices=...)`. With
-    curved edges, uniform strains are exact in the plane but not in space: move only mid-side nodes on the boundary.
+    The new vertices come after the existing ones, which keep their indices. `with_midsides` extends named sets. Edges
+    are straight; for a curved rest shape, move vertices by `mesh._replace(vertices=...)`. With curved edges, uniform
+    strains are exact in the plane but not in space: move only mid-side nodes on the boundary.
 
     Raises:
         InputError: the mesh is already quadratic.
@@ -268,7 +268,7 @@ def barycentric_split(mesh: Mesh) -> Mesh:
 
     In the plane, quadratic elements on a split mesh are the Scott-Vogelius pair of degree 2: it satisfies the inf-sup
     condition (Arnold and Qin 1992) and converges with order 3 even as nu approaches 1/2. In space this is proved only
-    from degree 3 on (Zhang 2005).
+    for degree 3 and above (Zhang 2005).
 
     Raises:
         InputError: the mesh is quadratic.

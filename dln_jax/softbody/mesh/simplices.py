@@ -1,4 +1,4 @@
-"""Volumes, shapes and facets of individual simplices, whether they form a mesh or not.
+"""Volumes, shapes and facets of individual simplices, in a mesh or not.
 
 Quadratic simplices have a mid-side node on each edge after their corners. With barycentric coordinates l, the shape
 functions are l_i (2 l_i - 1) at corner i and 4 l_i l_j between corners i and j. Their quadrature points (3 in a
@@ -21,7 +21,7 @@ FACETS = {2: ((0, 1), (1, 2), (2, 0)), 3: ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 
 the right-hand normal of a triangle points away from the body."""
 
 SIDES = {2: ((0, 1), (1, 2), (2, 0)), 3: ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))}
-"""Corners of the edges by dimension, in the order of the mid-side nodes (that of VTK)."""
+"""Corners of the edges by dimension, in the order of the mid-side nodes (VTK's order)."""
 _FRACTION = {2: 1 / 6, 3: (5 - math.sqrt(5)) / 20}
 """Smallest barycentric coordinate of the quadrature points, which are its permutations."""
 
@@ -29,8 +29,8 @@ _FRACTION = {2: 1 / 6, 3: (5 - math.sqrt(5)) / 20}
 def simplex_volumes(vertices: Float[AnyArray, "n dim"], elements: Int[np.ndarray, "m nodes"]) -> Float[AnyArray, " m"]:
     """Returns signed areas in m² or volumes in m³: det[x1 - x0, ..., xdim - x0] / dim!, negative if inverted.
 
-    Takes NumPy arrays, and JAX arrays for derivatives by the rest shape. The volume of a quadratic tetrahedron with
-    curved edges is that of the quadrature.
+    Takes NumPy arrays, and JAX arrays for derivatives by the rest shape. Quadrature gives the volume of a quadratic
+    tetrahedron with curved edges.
     """
     if elements.shape[1] > vertices.shape[1] + 1:
         return jacobians(vertices, elements).mean(axis=1) / math.factorial(vertices.shape[1])
@@ -75,7 +75,7 @@ def facet_rule(
     """Returns a facet's shape functions at its quadrature points, their derivatives by its coordinates, and weights.
 
     Nodes are the corners, then the mid-side nodes in the order of `SIDES`. The rules (centroid; Gauss with 2 points;
-    Strang and Fix 1973 with 6 points) are exact for the volume that the facets enclose.
+    Strang and Fix 1973 with 6 points) are exact for the enclosed volume.
     """
     if not quadratic:
         slopes = np.concatenate([-np.ones((1, dimension - 1)), np.eye(dimension - 1)])
@@ -106,7 +106,7 @@ def cofactors(F: Any) -> list[list[Any]]:
     """Returns the rows of cof F = det F F⁻ᵀ."""
     if len(F) == 2:
         return [[F[1][1], -F[1][0]], [-F[0][1], F[0][0]]]
-    # Cyclic indices take care of the signs.
+    # Cyclic indices give the signs.
     return [
         [
             F[(i + 1) % 3][(j + 1) % 3] * F[(i + 2) % 3][(j + 2) % 3]
@@ -118,9 +118,9 @@ def cofactors(F: Any) -> list[list[Any]]:
 
 
 def regularity(vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray, "m corners"]) -> Float[np.ndarray, " m"]:
-    """Returns the volume of every element divided by that of the regular simplex with the same longest edge.
+    """Returns the volume of every element relative to the regular simplex with the same longest edge.
 
-    1 for a regular simplex, 0 for a flat one, negative for an inverted one; also 0 if all corners coincide.
+    1 for a regular simplex, 0 for a flat simplex, negative for an inverted simplex; also 0 if all corners coincide.
     """
     dim, corners = vertices.shape[1], vertices[elements]
     pairs = itertools.combinations(range(dim + 1), 2)

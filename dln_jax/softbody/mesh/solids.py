@@ -37,16 +37,16 @@ ELEMENTS = {2: "triangle", 3: "tetra"}
 
 
 class FileMesh(NamedTuple):
-    """Content of a mesh file, before anything is selected or repaired."""
+    """Content of a mesh file before selection and repair."""
 
     points: Float[np.ndarray, "n 3"]
     cells: dict[str, Int[np.ndarray, "m k"]]
-    """Corners of the cells by kind, in meshio's names of linear ones: triangle, tetra, ..."""
+    """Corners of the cells by kind, in meshio's names for linear cells: triangle, tetra, ..."""
     vertex_sets: dict[str, Int[np.ndarray, " k"]]
     cell_sets: dict[str, dict[str, Int[np.ndarray, " k"]]]
     """Indices of cells by name of the set and kind of cell."""
     curved: Mapping[str, int] = MappingProxyType({})
-    """Number of cells of higher order, which have been reduced to their corners, by kind."""
+    """Number of higher-order cells, reduced to their corners, by kind."""
 
 
 class ReadMesh(NamedTuple):
@@ -54,7 +54,7 @@ class ReadMesh(NamedTuple):
 
     mesh: Mesh
     statements: tuple[str, ...]
-    """Sentences on what was left out, simplified or repaired. `Mesh.turned` counts reoriented elements."""
+    """Sentences about omissions, simplifications and repairs. `Mesh.turned` counts reoriented elements."""
 
 
 def solid_mesh(content: FileMesh, *, scale: float = 1.0, merge: float = MERGE) -> ReadMesh:
@@ -94,12 +94,10 @@ def solid_mesh(content: FileMesh, *, scale: float = 1.0, merge: float = MERGE) -
             raise InputError(f"it has {len(nodes)} {_plural(kind)}; mesh the body with {_plural(element)} only")
     elements, statements = content.cells[element], []
     if count := content.curved.get(element):
-        statements.append(
-            f"{count} elements of higher order are reduced to their corners, which makes their edges straight"
-        )
+        statements.append(f"{count} elements of higher order are reduced to their corners, with straight edges")
     if others := [f"{len(of)} {_plural(kind)}" for kind, of in content.cells.items() if kind != element and len(of)]:
         kept = f"{len(elements)} {_plural(element)}"
-        statements.append(f"the body is its {kept}; {', '.join(others)} are left out, and name vertices only")
+        statements.append(f"the body consists of {kept}; {', '.join(others)} are left out and only define vertex sets")
     sets = {name: (vertices, np.zeros(0, np.int64)) for name, vertices in content.vertex_sets.items()}
     for name, members in content.cell_sets.items():
         corners = [content.cells[kind][indices].ravel() for kind, indices in members.items()]
@@ -109,7 +107,8 @@ def solid_mesh(content: FileMesh, *, scale: float = 1.0, merge: float = MERGE) -
 
 
 def corners_by_kind(blocks: Sequence[tuple[str, np.ndarray]]) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Returns corners of the cells by kind, and how many have more nodes, from a file's blocks (linear kind, nodes)."""
+    """Returns corners of the cells by kind, and numbers of higher-order cells, from a file's blocks (linear kind,
+    nodes)."""
     cells, curved = {}, {}
     for kind in dict.fromkeys(kind for kind, _ in blocks):
         count = CELLS.get(kind, (3, None))[1]
@@ -130,7 +129,7 @@ def _in_plane(points: Float[np.ndarray, "n 3"], corners: Int[np.ndarray, " k"]) 
     if 2 in flat:
         return points[:, :2]
     if flat.size:
-        raise InputError(f"it lies in a plane {'xyz'[flat[0]]} = const; turn it into z = const, with y upwards")
+        raise InputError(f"it lies in a plane {'xyz'[flat[0]]} = const; rotate it to z = const, with y upwards")
     raise InputError(
         "it is a surface without volume; fill it with tetrahedra first, for example by Gmsh, TetGen or fTetWild"
     )
@@ -143,7 +142,7 @@ def _repaired(
     merge: float,
     statements: list[str],
 ) -> ReadMesh:
-    """Merges and removes vertices and elements, renumbers the sets, and states what was done."""
+    """Merges and removes vertices and elements, renumbers the sets, and reports the changes."""
     extent = float(np.ptp(points[elements.ravel()], axis=0).max())
     same = _first_of_same(points, merge * extent)
     shape = regularity(points[same], elements)
@@ -166,8 +165,8 @@ def _repaired(
             len(points) - len(np.unique(same)),
             f"duplicate vertices are merged (closer than {merge:.0e} of the extent, {merge * extent:.1e} m)",
         ),
-        (loose, "loose vertices, which belong to no element, are removed"),
-        (len(elements) - len(kept), "elements are listed more than once and count once"),
+        (loose, "loose vertices without an element are removed"),
+        (len(elements) - len(kept), "repeated elements are removed"),
     )
     statements += [f"{count} {what}" for count, what in counts if count]
     new_vertex = np.full(len(points), -1)
@@ -181,7 +180,7 @@ def _repaired(
 
 
 def _first_of_same(points: Float[np.ndarray, "n dim"], distance: float) -> Int[np.ndarray, " n"]:
-    """Returns for every point the smallest index among the points within this distance of it, and of those in turn."""
+    """Returns for every point the smallest index among the points connected to it by steps up to this distance."""
     if not distance > 0:
         return np.arange(len(points))
     pairs = KDTree(points).query_pairs(distance, output_type="ndarray")

@@ -49,7 +49,7 @@ def inner_surface(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
 
 
 def facets_in(mesh: Mesh, name: str) -> Int[np.ndarray, "f dim"]:
-    """Returns the facets of the boundary whose corners are all in a named set.
+    """Returns the boundary facets with all corners in a named set.
 
     Raises:
         InputError: the set does not exist, or contains no facet of the boundary.
@@ -65,15 +65,15 @@ def facets_in(mesh: Mesh, name: str) -> Int[np.ndarray, "f dim"]:
 def closed_surface(mesh: Mesh, facets: ArrayLike, *, cap: bool = False) -> Int[np.ndarray, "f dim"]:
     """Returns the facets of a chamber, oriented out of it.
 
-    Facets of the body's boundary are turned to point into its material, others, such as caps, like their neighbours. A
-    part without any boundary facet is turned so that it encloses a positive volume.
+    Boundary facets of the body are oriented into its material; other facets, such as caps, are oriented like their
+    neighbours. A part without boundary facets is oriented to enclose a positive volume.
 
     Args:
         facets: [f, dim] vertices, in any orientation and order.
         cap: close openings with flat facets between the vertices of their rims; in the plane, one opening at most.
 
     Raises:
-        InputError: facets are repeated or do not fit the mesh, or the surface is open; the message says where.
+        InputError: facets are repeated or do not fit the mesh, or the surface is open; the message locates the gap.
     """
     chosen = _oriented(mesh, checked_facets(mesh, facets))
     if cap:
@@ -103,7 +103,7 @@ def checked_facets(mesh: Mesh, facets: ArrayLike) -> Int[np.ndarray, "f dim"]:
     if wrong.any():
         bad = int(np.argmax(wrong))
         raise InputError(
-            f"facet {bad} is {chosen[bad].tolist()}; expected {mesh.dimension} different ones of 0..{n - 1}"
+            f"facet {bad} is {chosen[bad].tolist()}; expected {mesh.dimension} different vertices of 0..{n - 1}"
         )
     _, first, count = np.unique(ordered, axis=0, return_index=True, return_counts=True)
     if (count > 1).any():
@@ -115,7 +115,7 @@ def facet_nodes(mesh: Mesh, facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray,
     """Returns the corners of facets, followed in a quadratic mesh by mid-side nodes in the order of `facet_rule`.
 
     Raises:
-        InputError: a facet of a quadratic mesh has an edge without a mid-side node; caps do.
+        InputError: a facet of a quadratic mesh has an edge without a mid-side node, such as a cap.
     """
     if mesh.midsides is None:
         return facets
@@ -127,7 +127,7 @@ def facet_nodes(mesh: Mesh, facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray,
         nodes = [[middles[tuple(edge)] for edge in of_facet] for of_facet in wanted]
     except KeyError as error:
         raise InputError(
-            f"edge {list(error.args[0])} of a facet is no edge of the quadratic mesh; only linear meshes can have caps"
+            f"edge {list(error.args[0])} of a facet is not in the quadratic mesh; only linear meshes can have caps"
         ) from None
     return np.append(facets, nodes, axis=1)
 
@@ -144,7 +144,7 @@ def enclosed_volume(x: Float[AnyArray, "n dim"], nodes: Int[np.ndarray, "f nodes
 def facet_points(
     nodes: Float[AnyArray, "f nodes dim"],
 ) -> tuple[Float[AnyArray, "f points dim"], Float[AnyArray, "f points dim"]]:
-    """Returns quadrature points of facets in m, and normals whose lengths are the points' shares of the area in m²."""
+    """Returns quadrature points of facets in m, and normals with the points' shares of the area as lengths, in m²."""
     values, slopes, weights = facet_rule(nodes.shape[2], nodes.shape[1] > nodes.shape[2])
     points = (nodes.swapaxes(1, 2)[:, None] @ values[:, :, None])[..., 0]
     tangents = nodes.swapaxes(1, 2)[:, None] @ slopes
@@ -157,7 +157,7 @@ def facet_points(
 
 
 def _ridges(facets: Int[np.ndarray, "f dim"]) -> tuple[Int[np.ndarray, "f dim d"], Int[np.ndarray, "f dim"]]:
-    """Returns the facets' ends or edges, with sorted vertices, and their direction (±1) in each facet."""
+    """Returns the ends or edges of facets, with sorted vertices, and their direction (±1) in each facet."""
     if facets.shape[1] == 2:
         return facets[:, :, None], np.broadcast_to([-1, 1], facets.shape)
     ends = facets[:, np.array(SIDES[2])]
@@ -165,7 +165,7 @@ def _ridges(facets: Int[np.ndarray, "f dim"]) -> tuple[Int[np.ndarray, "f dim d"
 
 
 def _open_ridges(facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "g d"]:
-    """Returns the ridges that facets do not pass equally often both ways, in the direction of the surplus."""
+    """Returns the unbalanced ridges, used more often in one direction, in this direction."""
     ridges, signs = _ridges(facets)
     distinct, number = np.unique(ridges.reshape(-1, ridges.shape[2]), axis=0, return_inverse=True)
     net = np.bincount(number.reshape(-1), weights=signs.ravel()).astype(int)
@@ -177,7 +177,7 @@ def _open_ridges(facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "g d"]:
 
 
 def _oriented(mesh: Mesh, facets: Int[np.ndarray, "f dim"]) -> Int[np.ndarray, "f dim"]:
-    """Turns facets of the boundary to point into the body, and others like their neighbours."""
+    """Orients boundary facets into the body, and other facets like their neighbours."""
     outside = {frozenset(facet): facet for facet in boundary(mesh).tolist()}
     inward = [outside.get(frozenset(facet), [])[::-1] for facet in facets.tolist()]
     owners: dict[tuple, list[int]] = {}

@@ -2,24 +2,24 @@
 
     V = k phi(d),   phi = 0 for d >= 0,  -d³/(6 w) for -w <= d < 0,  d²/2 + w d/2 + w²/6 for d < -w
 
-with the signed distance d to the surface. phi is twice continuously differentiable for w > 0; a vertex rests at the
-depth where k |phi'(d)| carries its weight. Contact and friction are one term with shared parameters: the normal force
-of the friction comes from the same k and is differentiable by it. Without a coefficient, friction is not computed.
+with the signed distance d to the surface. phi is twice continuously differentiable for w > 0. A vertex rests at the
+depth where k |phi'(d)| equals its weight. Contact and friction are one term with shared parameters: the normal force
+for friction comes from the same k and is differentiable by it. Without a coefficient, friction is not computed.
 
     D = mu lambda_n f(|u|),   u = (1 - n nᵀ)(x - x_n),   f(u) = u²/e - u³/(3 e²) for u < e,  u - e/3 beyond,
 
-after Li et al. 2020 (Incremental Potential Contact, section 5), with their constant chosen such that f(0) = 0, and
-normals n and normal forces lambda_n at the start of the step (or at the previous solution of a repeated step, see
-`make_step`). The force mu lambda_n opposes slip above the threshold speed e/dt and falls smoothly to zero below it: a
-block that "sticks" on a slope creeps more slowly than the threshold. f is twice continuously differentiable. The slip e
-must be well above the rounding of the positions: in float32, 1e-4 m for a body of a metre.
+after Li et al. 2020 (Incremental Potential Contact, section 5), with the constant for f(0) = 0, and with normals n and
+normal forces lambda_n at the start of the step (or at the previous solution of a repeated step, see `make_step`). The
+force mu lambda_n opposes slip above the threshold speed e/dt and falls smoothly to zero below it: a block that "sticks"
+on a slope creeps more slowly than the threshold. f is twice continuously differentiable. The slip e must be well above
+the rounding of the positions: in float32, 1e-4 m for a body of a metre.
 
 Contact damping adds the force c lambda (-d') to the normal force lambda = -k phi'(d), with c in s/m (Hunt and Crossley
 1975). It comes from the dissipation
 
     c k/dt ∫ -phi'(t) (t - d_n) dt over d_n <= t <= d  =  c k/dt (Phi(d) - Phi(d_n) - phi(d) (d - d_n)),  Phi' = phi
 
-A point mass that hits at speed u rebounds at e u, whatever its mass, k and phi (`damping_of_restitution`):
+A point mass with impact speed u rebounds at e u for any mass, k and phi (`damping_of_restitution`):
 
     c u (1 + e) = ln((1 + c u) / (1 - c e u))
 """
@@ -48,7 +48,8 @@ from dln_jax.softbody.terms.term import (
 )
 from dln_jax.types import InputError, Scalar, require_positive
 
-# Below this ratio of squared slip to squared threshold, the cubic part of f is rounding and its derivatives overflow.
+# Below this ratio of squared slip to squared threshold, the cubic part of f is lost in rounding and its derivatives
+# overflow.
 _NO_SLIP = 1e-16
 
 
@@ -68,7 +69,7 @@ class PlaneContact(NamedTuple):
 
     @property
     def pose(self) -> Pose:
-        """A plane turns about the origin: other motions along itself cannot be seen from its normal and offset."""
+        """A plane turns about the origin; its normal and offset show no other tangential motion."""
         return plane_pose(self.normal, self.offset)
 
 
@@ -82,7 +83,7 @@ class Slip(NamedTuple):
     force: Float[Array, "*m"]
     """Largest friction force mu lambda_n, in N."""
     threshold: Float[Array, "*m"]
-    """Slip e per step, in m, where friction reaches its largest force."""
+    """Slip e per step, in m, at which friction reaches its largest force."""
 
 
 def plane_contact(
@@ -99,9 +100,9 @@ def plane_contact(
 ) -> Term:
     """Contact with the half-space n·x < offset, for the unit normal n.
 
-    Stiffness k is in N/m and width w in m. Width 0 gives ½ k d² below the plane, which is only once continuously
-    differentiable. `friction` is Coulomb's coefficient, reached at the threshold speed in m/s. `damping` c in s/m
-    dissipates in the normal direction (`damping_of_restitution`).
+    Stiffness k is in N/m and width w in m. Width 0 gives ½ k d² below the plane, only once continuously differentiable.
+    `friction` is Coulomb's coefficient, fully developed at the threshold speed in m/s. `damping` c in s/m dissipates in
+    the normal direction (`damping_of_restitution`).
     """
     require_positive(threshold_speed=threshold_speed)
     if width != 0.0:
@@ -161,14 +162,14 @@ def plane_pose(normal: Float[Array, " dim"], offset: Float[Array, ""]) -> Pose:
 def motion_of(
     name: str, parameters: Any, before: Mapping[str, Pose] | None, x: Float[Array, "m dim"]
 ) -> Float[Array, "m dim"]:
-    """Returns the motion in m of the points x of a term's surface from the pose before; exactly 0 at rest."""
+    """Returns the motion in m of points x on a term's surface since the previous pose; exactly 0 at rest."""
     if not before or name not in before:
         return jnp.zeros_like(x)
     (origin, axes), (goal, ends) = before[name], parameters.pose
     arms, change = x - origin, ends - axes
     if len(axes) != 1:
         return goal - origin + arms @ axes.T @ change
-    # The smallest rotation that turns the axis.
+    # The smallest rotation between the axes.
     bend, along = jnp.sum(change**2) / 2, arms @ axes.T
     across = (arms @ change.T + along * bend) / (2 - bend)
     return goal - origin + along * change - across * (axes + ends)
@@ -225,10 +226,10 @@ def penalty_integral(distance: Float[Array, "*m"], width: float) -> Float[Array,
 
 
 def damping_of_restitution(restitution: float, speed: float) -> float:
-    """Returns the damping c in s/m that makes a point mass rebound at `restitution` times its speed, in m/s.
+    """Returns the damping c in s/m for a rebound of a point mass at `restitution` times its speed, in m/s.
 
-    c suits this speed only: slower impacts rebound faster, at 1 - 2/3 c u for small c u. A body also turns some of the
-    energy into its own vibrations, which is not a loss of the contact.
+    c is exact at this speed only: slower impacts have a larger coefficient, 1 - 2/3 c u for small c u. A body also
+    converts some energy into vibrations, which is not a loss of the contact.
 
     Raises:
         InputError: the speed is not positive, or the coefficient is not between 0.05 and 1.

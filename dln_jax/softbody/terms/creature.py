@@ -1,6 +1,6 @@
 """Terms of the published soft creatures, a preset for comparison with their simulator (J. Rojas, algovivo).
 
-There, a step minimises ½ sum m |x - x_n - h v_n|² + h² V(x); here, the same divided by h², so that V is unscaled:
+Their step minimises ½ sum m |x - x_n - h v_n|² + h² V(x). Here the sum is divided by h², so V is unscaled:
 
     element    ½ mu (I1 - dim) - mu s(J) + ½ lambda s(J)²,   s(J) = -1.5 + 2 J - 0.5 J²
     muscle     ½ k_m ((l - a l0)/(a l0))²,   l = sqrt(d² + 1e-6)
@@ -8,12 +8,12 @@ There, a step minimises ½ sum m |x - x_n - h v_n|² + h² V(x); here, the same 
     ground     k y² for y < 0, plus friction k_f ((x - x_n)/h)² (0.01 - y_n) for y_n < 0.01
 
 s is the second-order expansion of ln J, and the weight of an element is 1 for any size, so mu and lambda are in J.
-Friction is viscous and lagged. k_f is in kg/m, because its part of V is an energy although it models friction: with
-vx = (x - x_n)/h the force is -2 k_f (0.01 - y_n) vx / h, which depends on the time step, and h² V does not contain h.
-A static solve (h infinite) has no friction.
+Friction is viscous and lagged. k_f is in kg/m, because the friction enters V as an energy. With vx = (x - x_n)/h the
+force is -2 k_f (0.01 - y_n) vx / h, which depends on the time step; h² V does not contain h. A static solve (h
+infinite) has no friction.
 
-The published creatures are planar and their ground is flat. In space y is the last coordinate, x stands for the others,
-and elements are tetrahedra. Above rough ground, y is the height above sum_i A_i sin(k_i·x + phi_i).
+The published creatures are planar, on flat ground. In space y is the last coordinate, x are the others, and elements
+are tetrahedra. Above rough ground, y is the height above sum_i A_i sin(k_i·x + phi_i).
 """
 
 from collections.abc import Sequence
@@ -51,7 +51,7 @@ class CreatureMaterial(NamedTuple):
 
 
 class Bumps(NamedTuple):
-    """Waves of the ground, whose height at x is the sum of `amplitude` sin(`wave_vector`·x + `phase`)."""
+    """Waves of the ground: the height at x is the sum of `amplitude` sin(`wave_vector`·x + `phase`)."""
 
     amplitude: Float[Array, " w"]
     """In m."""
@@ -86,12 +86,12 @@ def creature_terms(
 ) -> tuple[Term, ...]:
     """Returns the terms "elastic", "muscles", "gravity" and "ground" of a creature above y = 0.
 
-    Muscles are pairs of vertices [k, 2]. Their actuation is the control of a step, 0.25 to 1 in the published
+    Muscles are pairs of vertices [k, 2]. The control of a step is their actuation, 0.25 to 1 in the published
     creatures. With `bumps` the ground is rough.
     """
     if bumps is not None and np.shape(bumps.wave_vector)[-1] != mesh.dimension - 1:
         got, expected = np.shape(bumps.wave_vector)[-1], mesh.dimension - 1
-        raise InputError(f"the bumps' wave vectors have {got} components; expected {expected}, the horizontal ones")
+        raise InputError(f"the bumps' wave vectors have {got} components; expected {expected}, one per horizontal axis")
     return (
         _elements(mesh),
         driven_springs(muscles, stiffness=90.0, softening=1e-3),

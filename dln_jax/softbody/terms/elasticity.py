@@ -5,28 +5,28 @@
     mixed:      J = sum of w_q det F_q / volume,   energy = sum of w_q W(F_q, mu, 0) + volume lambda/2 (J - 1)²
 
 with the rest shape X and Lamé parameters mu = E / 2(1 + nu) and lambda = E nu / (1 + nu)(1 - 2 nu). The material is any
-density of `strain_energies`, or a custom one of the same form.
+density of `strain_energies`, or a custom density of the same form.
 
 Linear elements lock: they are too stiff in bending, and nearly rigid as nu approaches 1/2. Quadratic elements represent
 bending; their displacements converge with order 3 for smooth solutions. As nu approaches 1/2, they need mixed elements.
 
-Mixed elements are quadratic in displacement with one pressure per element, p = lambda (J - 1), eliminated from
-sum of w_q W(F_q, mu, 0) + volume (p (J - 1) - p²/(2 lambda)) (P2/P0, a perturbed Lagrangian; at small strains the
-selective reduced integration of Malkus and Hughes 1978). The result is an energy of the positions alone, so that a step
-stays a minimisation. In the plane the pair satisfies the inf-sup condition (Boffi, Brezzi and Fortin 2013, chapter 8)
-and does not lock. In space there is no such proof, because no node lies inside a face to control its flux; clamped
-cubes of unordered tetrahedra converge without locking (tests/softbody/test_quadratic_elements.py). A constant pressure
-limits displacements to order 2, and it cannot vary through the thickness of a beam: with one element across, the
-pressure that bending needs is missing and the beam is up to 1.6 times too soft. For such beams use quadratic elements,
-split by `mesh.barycentric_split` if nu is close to 1/2.
+Mixed elements are quadratic in displacement with one pressure per element, p = lambda (J - 1), eliminated from sum of
+w_q W(F_q, mu, 0) + volume (p (J - 1) - p²/(2 lambda)) (P2/P0, a perturbed Lagrangian; at small strains the selective
+reduced integration of Malkus and Hughes 1978). The result is an energy of the positions alone, so a step remains a
+minimisation. In the plane the pair satisfies the inf-sup condition (Boffi, Brezzi and Fortin 2013, chapter 8) and does
+not lock. In space there is no such proof, because no node lies inside a face to control its flux; clamped cubes of
+unordered tetrahedra converge without locking (tests/softbody/test_quadratic_elements.py). A constant pressure limits
+displacements to order 2, and it cannot vary through the thickness of a beam. With one element across, the beam is up to
+1.6 times too soft in bending. For such beams use quadratic elements, split by `mesh.barycentric_split` if nu is close
+to 1/2.
 
-Rayleigh damping is an energy, too, with the forces alpha M v and beta K v. A step of length dt from x_n minimises the
+Rayleigh damping, with the forces alpha M v and beta K v, is an energy too. A step of length dt from x_n minimises the
 dissipation
 
     mass:       alpha m |x - x_n|² / (2 dt),                                    force  -alpha m v
     stiffness:  beta volume (mu |dE|² + lambda/2 tr(dE)²) / dt,   dE = E(x) - E(x_n),   E = (FᵀF - I)/2
 
-with the velocity v = (x - x_n)/dt. The second is a Kelvin-Voigt material whose viscosities are beta times the Lamé
+with the velocity v = (x - x_n)/dt. The second is a Kelvin-Voigt material with viscosities of beta times the Lamé
 parameters: rotations do not dissipate, and for small strains its force is -beta K v with the stiffness K of linear
 elasticity. A vibration of frequency omega decays as exp(-(alpha + beta omega²) t / 2). A static solve has no damping.
 Backward Euler and bdf2 integrate these forces with an error of first order in dt, other integrators of second order.
@@ -91,15 +91,15 @@ def elastic(
     """Elastic energy of all elements of a mesh, linear or quadratic; parameters are a `Material`.
 
     Young's modulus in Pa must be positive and Poisson's ratio between -1 and 0.5 (exclusive), one for all elements or
-    one per element. In 2-D the strain is plane, so mu and lambda are those of the solid.
+    one per element. In 2-D the strain is plane, so mu and lambda are as in 3-D.
 
     Mixed elements, for nu near 1/2, need a quadratic mesh. Their volumetric energy is lambda/2 (J - 1)² of the mean J,
-    as in the stable neo-Hookean density. Other densities differ from their own by third order in J - 1; those whose
-    lambda multiplies a trace of strains (St. Venant-Kirchhoff, corotated) by third order in strain.
+    as in the stable neo-Hookean density. For other densities the difference is of third order in J - 1, or of third
+    order in strain if lambda multiplies a trace of strains (St. Venant-Kirchhoff, corotated).
 
     Raises:
-        InputError: a parameter is out of range (the message names the element), `mixed` with a linear mesh, or a
-            quadratic element that its mid-side nodes turn inside out.
+        InputError: a parameter is out of range (the message names the element), `mixed` is used with a linear mesh, or
+            the mid-side nodes of a quadratic element invert it.
     """
     count = len(mesh.elements)
     if mesh.midsides is None and mixed:
@@ -127,7 +127,7 @@ def elastic(
     def quadratic_energy(corners: Corners, element: tuple[Array, ...]) -> Scalar:
         x = jnp.asarray(corners)
         gradients, weights, mu, lam = element
-        # Rows of F at all points at once: products of small matrices compile much faster than unrolled sums.
+        # All points at once: products of small matrices compile much faster than unrolled sums.
         axes = range(x.shape[1])
         F = [[gradients[:, :, j] @ x[:, i] for j in axes] for i in axes]
         of_points = 0.0 * lam if mixed else lam
@@ -142,7 +142,7 @@ def elastic(
 
 
 def mass_damping(mesh: Mesh, *, rate: Numbers, name: str = "mass_damping") -> Term:
-    """Damps all velocities of a mesh's vertices, including rigid motions, at the rate alpha in 1/s."""
+    """Damps the velocities of all vertices, including rigid motions, at the rate alpha in 1/s."""
     count = len(mesh.vertices)
     parameters = MassDamping(material("rate", rate, count, "vertex", NOT_NEGATIVE))
 
@@ -200,7 +200,7 @@ def lame_parameters(youngs_modulus: Array, poisson_ratio: Array) -> tuple[Array,
 def rest_geometry(corners: Float[Array, "corners dim"]) -> tuple[Float[Array, "corners dim"], Scalar]:
     """Returns the gradients of a simplex's linear shape functions in 1/m, and its signed volume in m³ (m² in 2-D).
 
-    F = sum over corners of x_k (grad N_k)ᵀ. The formulas are written out and differentiable.
+    F = sum over corners of x_k (grad N_k)ᵀ. The explicit formulas are differentiable.
     """
     axes = range(corners.shape[1])
     edges = [[corners[k + 1, i] - corners[0, i] for k in axes] for i in axes]

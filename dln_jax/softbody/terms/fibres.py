@@ -32,7 +32,7 @@ class Fibres(NamedTuple):
     strength: Float[Array, "..."]
     """s in Pa."""
     activation: Float[Array, " groups"] | None
-    """Activation a of every group, from 0 to 1, or `None` if it is the control."""
+    """Activation a of every group, from 0 to 1; `None` if the control sets it."""
     stiffness: Float[Array, "..."] | None
     """k in Pa, or `None`."""
 
@@ -81,7 +81,7 @@ def fibres(
     if not isinstance(ways, Tracer):
         lengths = np.atleast_1d(np.linalg.norm(np.asarray(ways), axis=-1))
         if (wrong := ~(np.isfinite(lengths) & (lengths > 0))).any():
-            raise InputError(f"the direction of fibres {np.argmax(wrong)} has no length; expected a unit vector")
+            raise InputError(f"the direction of fibres {np.argmax(wrong)} is zero; expected a direction")
     parameters = Fibres(
         ways,
         material("strength", strength, count, "element", NOT_NEGATIVE),

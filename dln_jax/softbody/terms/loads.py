@@ -10,9 +10,9 @@ the rest shape (per m of an edge in the plane, 1 m thick) and a body force b in 
     pressure:  -p V(x)                                         force on every facet:  p times its area, along its normal
     gas:       -n R T ln(V(x)/V0) + p_a (V(x) - V0)             p = n R T / V - p_a
 
-with the volume V that a closed surface of facets encloses (`mesh.surfaces`), in m³, or m² for 1 m of thickness. A gauge
+with the volume V inside a closed surface of facets (`mesh.surfaces`), in m³, or m² for 1 m of thickness. A gauge
 pressure is a sum over facets. A gas couples all vertices of its chamber, because its pressure falls as the chamber
-grows: it is one element, whose Hessian is dense.
+grows: it is one element with a dense Hessian.
 """
 
 import math
@@ -64,21 +64,21 @@ class Load(NamedTuple):
     """Parameters of a load."""
 
     force: Float[Array, "*m dim"] | None
-    """Load in N, N/m² or N/m³, or `None` if it is the control."""
+    """Load in N, N/m² or N/m³; `None` if the control sets it."""
 
 
 class Pressure(NamedTuple):
     """Parameters of a gauge pressure."""
 
     pressure: Float[Array, ""] | None
-    """Gauge pressure p in Pa, or `None` if it is the control."""
+    """Gauge pressure p in Pa; `None` if the control sets it."""
 
 
 class Gas(NamedTuple):
     """Parameters of a sealed gas."""
 
     amount: Float[Array, ""] | None
-    """n R T in J, or `None` if it is the control."""
+    """n R T in J; `None` if the control sets it."""
     ambient: Float[Array, ""]
     """Ambient pressure p_a in Pa."""
 
@@ -86,7 +86,7 @@ class Gas(NamedTuple):
 def gravity(mesh: Mesh, acceleration: Numbers | None = None, *, name: str = "gravity") -> Term:
     """-m g·x for all vertices of a mesh; g is the acceleration in m/s².
 
-    It is by default 9.81 m/s² against the last axis, which points up: y in the plane, z in space.
+    Default: 9.81 m/s² against the last axis, which points up (y in the plane, z in space).
     """
     down = (*(0.0,) * (mesh.dimension - 1), -9.81)
     parameters = Gravity(vector("acceleration", down if acceleration is None else acceleration))
@@ -153,7 +153,7 @@ def _load(
             more = f", or [{count}, {dimension}]: one for each vertex" if per_vertex else ""
             raise InputError(f"the force of '{name}' has shape {list(force.shape)}; expected [{dimension}]{more}")
         if not isinstance(force, Tracer) and not np.isfinite(force).all():
-            raise InputError(f"the force of '{name}' is not finite; expected numbers")
+            raise InputError(f"the force of '{name}' is not finite; expected finite numbers")
 
     def prepare(parameters: Load, context: Context) -> Float[Array, "m dim"]:
         force = value_or_control(parameters.force, name, context, (dimension,), "the components of the force")
@@ -165,7 +165,7 @@ def _load(
 
 
 def _dead(x: Corners, force: Float[Array, " dim"]) -> Scalar:
-    """Energy of a vertex under a force that does not change."""
+    """Returns the energy of a vertex under a constant force."""
     return -jnp.asarray(sum(force[i] * coordinate for i, coordinate in enumerate(x[0])))
 
 
@@ -179,7 +179,8 @@ def pressure(
     """Gauge pressure in Pa in a chamber with these facets, such as `inner_surface(mesh)` or `facets_in(mesh, name)`.
 
     It pushes against the material; a positive pressure on an outer surface compresses the body. By default the pressure
-    is the control of the step, one number. Openings need caps, your own or `cap=True`; a cap's force acts on its rim.
+    is the control of the step, one number. Openings need caps: your own, or `cap=True`. The force of a cap acts on its
+    rim.
 
     Raises:
         InputError: as for `closed_surface`, or the pressure is not finite.
@@ -191,7 +192,7 @@ def pressure(
 
     def prepare(parameters: Pressure, context: Context) -> tuple[Array, Array]:
         value = value_or_control(parameters.pressure, name, context, (), "the gauge pressure in Pa")
-        # The sum does not depend on the origin; its rounding is smallest near the chamber.
+        # The sum does not depend on the origin; rounding is smallest for an origin near the chamber.
         centre = jax.lax.stop_gradient(context.x[vertices].mean(axis=0))
         return jnp.broadcast_to(value, len(nodes)), jnp.broadcast_to(centre, (len(nodes), dimension))
 
@@ -217,7 +218,7 @@ def gas(
     cap: bool = False,
     name: str = "gas",
 ) -> Term:
-    """A sealed amount of gas at constant temperature in a chamber; facets and caps are those of `pressure`.
+    """A sealed amount of gas at constant temperature in a chamber; facets and caps as for `pressure`.
 
     Args:
         pressure: gauge pressure in Pa of the gas in the rest shape; it sets the amount n R T = (p + p_a) V0. With
@@ -234,7 +235,7 @@ def gas(
     if len(vertices) > MOST_VERTICES:
         raise InputError(
             f"the chamber of '{name}' has {len(vertices)} vertices; expected at most {MOST_VERTICES}, because the gas "
-            "couples all of them: use a coarser mesh, or a given pressure"
+            "couples all of them: use a coarser mesh, or a prescribed pressure"
         )
     if not volume > 0:
         raise InputError(f"the surface of '{name}' encloses {volume:.3g} in the rest shape; expected a positive volume")
@@ -253,7 +254,7 @@ def gas(
     def energy(x: Corners, chamber: tuple[Any, ...]) -> Scalar:
         amount, ambient, centre = chamber
         now = enclosed_volume(jnp.asarray(x) - centre, local)
-        # The energy of a volume that is not positive is NaN, so that no step accepts it.
+        # The energy is NaN without a positive volume, so no step accepts it.
         return -amount * jnp.log(now / volume) + ambient * (now - volume)
 
     control = () if pressure is None else None

@@ -2,9 +2,8 @@
 
     of given length:  ½ k max(0, L(x) - l)²      of given tension:  T L(x),      L = sum over segments |p_{i+1} - p_i|
 
-A tendon pulls and never pushes. A point p of its path is a vertex, or a point inside an element that moves with it. The
-total length couples all points, because the cord slides through them with the same tension everywhere: a tendon is one
-element.
+A tendon pulls and never pushes. A point p of its path is a vertex, or a point fixed in an element. The cord slides
+through the points with the same tension everywhere, so its length couples all points: a tendon is one element.
 """
 
 from collections.abc import Callable
@@ -56,14 +55,14 @@ class TendonOfLength(NamedTuple):
     stiffness: Float[Array, ""]
     """k in N/m."""
     length: Float[Array, ""] | None
-    """l in m, or `None` if it is the control."""
+    """l in m; `None` if the control sets it."""
 
 
 class TendonOfTension(NamedTuple):
     """Parameters of a tendon with a given tension."""
 
     tension: Float[Array, ""] | None
-    """T in N, or `None` if it is the control."""
+    """T in N; `None` if the control sets it."""
 
 
 def springs(
@@ -76,9 +75,9 @@ def springs(
 ) -> Term:
     """½ k (l - l0)² for pairs of vertices, with l = sqrt(d² + softening²) and the distance d.
 
-    The rest length l0 in m is `rest_length`, by default that of the rest shape (with the same softening, so that it
-    carries no force). Without softening, the force of a compressed spring has no direction at d = 0 and its stiffness
-    no bound. Exactly there, only the well-defined parts are kept (zero force, stiffness k), which is exact for l0 = 0.
+    The rest length l0 in m is `rest_length`, by default the length in the rest shape, with the same softening and
+    without force. Without softening, the force of a compressed spring has no direction at d = 0, and its stiffness no
+    bound. At this point the spring has zero force and stiffness k, which is exact for l0 = 0.
     """
     indices = vertex_rows("pairs of springs", pairs, 2)
     count = len(indices)
@@ -129,7 +128,7 @@ def _energy(softening: float):
 
 
 def _ends(_: Any) -> list[list[float]]:
-    """Weights of the two vertices in a spring's edge."""
+    """Returns the weights of the two vertices in a spring's edge."""
     return [[-1.0], [1.0]]
 
 
@@ -153,7 +152,8 @@ def tendon_of_length(
 
     Args:
         path: vertices [p], or points [p, dim] of the rest shape in m.
-        length: l; by default l is the control of the step, one number. `path_length` returns that of the rest shape.
+        length: l; by default l is the control of the step, one number. `path_length` returns the length in the rest
+            shape.
 
     Raises:
         InputError: the path has fewer than two points, leaves the body or repeats a point, or a number is out of range.
@@ -255,7 +255,7 @@ def _located(mesh: Mesh, points: ArrayLike) -> tuple[Int[np.ndarray, "p nodes"],
     shares = coordinates[np.arange(len(positions)), elements]
     if len(outside := np.flatnonzero(shares.min(axis=1) < -_OUTSIDE)):
         point = positions[outside[0]].tolist()
-        raise InputError(f"point {outside[0]} at {point} m is outside of the body; expected a point in an element")
+        raise InputError(f"point {outside[0]} at {point} m is outside the body; expected a point in an element")
     if mesh.midsides is not None:
         i, j = np.array(SIDES[mesh.dimension]).T
         shares = np.concatenate([shares * (2 * shares - 1), 4 * shares[:, i] * shares[:, j]], axis=1)

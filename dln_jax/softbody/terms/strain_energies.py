@@ -1,8 +1,8 @@
 """Energy densities of isotropic elastic materials, in J per m² or m³ of the rest shape, as functions of F = dx/dX.
 
 With I1 = |F|² and J = det F, all densities have W = 0 and no stress at rest and, for small strains e = sym(F - I), the
-energy mu |e|² + lambda/2 tr(e)² of linear elasticity, in 2-D (plane strain) and in 3-D. F is a sequence of rows, so
-that all operations are on scalars, which fuse under `vmap`.
+energy mu |e|² + lambda/2 tr(e)² of linear elasticity, in 2-D (plane strain) and in 3-D. F is a sequence of rows: all
+operations are on scalars and fuse under `vmap`.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,14 +21,14 @@ StrainEnergy = Callable[[DeformationGradient, Scalar, Scalar], Scalar]
 """(F, mu, lambda) -> W in J/m^dim; the Lamé parameters are in Pa."""
 
 _LAGUERRE_STEPS = 20
-"""Enough for double roots, where convergence is linear; otherwise 1 to 4 suffice."""
+"""Largest number of iterations: enough for double roots, with linear convergence; otherwise 1 to 4 suffice."""
 
 
 def neo_hookean(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
     """W = mu/2 (I1 - dim) - mu ln J + lambda/2 (ln J)² (Bonet and Wood 2008, eq. 6.28).
 
     An inverted or collapsed element (J <= 0) has infinite energy, which every line search refuses, and zero
-    derivatives, which do not affect those of other elements.
+    derivatives, which leave the sums over elements unchanged.
     """
     J = determinant(F)
     valid = J > 0
@@ -40,7 +40,7 @@ def neo_hookean(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
 def stable_neo_hookean(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
     """W = mu/2 (I1 - dim) - mu (J - 1) + (lambda + mu)/2 (J - 1)² (Smith, de Goes and Kim 2018).
 
-    The density is a polynomial: finite and smooth for every F, even inverted or collapsed. The paper's lambda is
+    The density is a polynomial: finite and smooth for every F, even inverted or collapsed. The paper's lambda equals
     lambda + mu of linear elasticity, because -mu (J - 1) alone contributes -mu/2 tr(e)² to second order. The paper's
     term -mu/2 ln(I1 + 1) is left out, so that the point F = 0 is stationary; at rest nothing changes.
     """
@@ -76,8 +76,9 @@ def corotated(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
     """W = mu |F - R|² + lambda/2 tr(RᵀF - I)² with the rotation R closest to F (McAdams et al. 2011).
 
     In invariants, W = mu (I1 - 2 s + dim) + lambda/2 (s - dim)², where s = tr(RᵀF) is the sum of the singular values,
-    the smallest with the sign of J. Where the two smallest cancel, R is not unique and W has a crease: at mirror images
-    in 2-D, in 3-D at elements collapsed to a line or mirrored in the plane of equal stretches. See `rotation_trace`.
+    and the smallest one has the sign of J. Where the two smallest cancel, R is not unique and W has a crease: in 2-D at
+    mirror images, in 3-D at elements collapsed to a line or mirrored in the plane of equal stretches. See
+    `rotation_trace`.
     """
     s, dimension = rotation_trace(F), len(F)
     return mu * (squared_norm(F) - 2.0 * s + dimension) + 0.5 * lam * (s - dimension) ** 2
@@ -92,7 +93,7 @@ def rotation_trace(F: DeformationGradient) -> Scalar:
     """Returns s = max over rotations R of tr(RᵀF), with correct first and second derivatives, without an SVD.
 
     In 2-D s² = (F11 + F22)² + (F21 - F12)². In 3-D s is the largest root of (s² - I1)² - 8 J s - 4 |cof F|² (the
-    characteristic polynomial of Davenport's 4x4 matrix, whose roots are all real). On the crease this root is double or
+    characteristic polynomial of Davenport's 4x4 matrix, with real roots only). On the crease this root is double or
     triple, so s is accurate to 1e-8 or 1e-6 (in float64). The derivative there is F s/|F|², correct for a change of
     size; it is zero at F = 0 and on the crease in 2-D, where s = 0.
     """

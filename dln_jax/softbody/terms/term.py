@@ -2,12 +2,12 @@
 
     V(x) = sum over terms, sum over elements e:  energy(x[indices[e]], data[e])
 
-An element is whatever the energy couples: the corners of a triangle, the two ends of a spring, a single vertex above
-ground. `prepare` turns a term's parameters into the data of its elements once per time step, so that everything an
-element needs (rest shape, material, actuation, lagged contact forces) is differentiable.
+An element is a set of coupled vertices: the corners of a triangle, the two ends of a spring, a single vertex above
+ground. `prepare` turns a term's parameters into the data of its elements once per time step, so all data of an element
+(rest shape, material, actuation, lagged contact forces) are differentiable.
 
-Values passed to the factories of terms are checked when the scene is built. Traced values (a scene built under `jit` or
-`grad`) pass unchecked, like those that later replace the defaults.
+Factories of terms check their values when the scene is built. Traced values (a scene built under `jit` or `grad`) are
+not checked, nor are values that later replace the defaults.
 """
 
 import math
@@ -30,12 +30,12 @@ Indices = ArrayLike | Sequence[int | np.integer] | Sequence[Sequence[int | np.in
 
 
 Pose = tuple[Float[Array, " dim"], Float[Array, "k dim"]]
-"""Origin in m and orthonormal axes of a rigid surface, from which friction and damping take its motion: the property
-`pose` of a term's parameters. One axis turns without spinning about itself, and without axes nothing turns."""
+"""Origin in m and orthonormal axes of a rigid surface; friction and damping take its motion from them. It is the
+property `pose` of a term's parameters. A single axis turns without spin, and without axes nothing turns."""
 
 
 class Context(NamedTuple):
-    """Data of a time step that terms prepare their elements from."""
+    """Data of a time step for the preparation of elements."""
 
     rest: Float[Array, "n dim"]
     """Rest shape in m."""
@@ -46,9 +46,9 @@ class Context(NamedTuple):
     dt: Float[Array, ""]
     """Length of the step in s; infinite for a static solve."""
     control: Any = None
-    """Control of the step for this term, if any: an array; for the scene's only actuator the whole control."""
+    """Control of the step for this term, if any: an array (for a single actuator the whole control)."""
     lag: Float[Array, "n dim"] | None = None
-    """Positions in m for friction's normal forces and directions; by default those at the start."""
+    """Positions in m for the normal forces and directions of friction; by default at the start of the step."""
     before: Mapping[str, Pose] | None = None
     """Poses of surfaces a time dt before the end of the step, by the names of their terms; others do not move."""
 
@@ -61,8 +61,9 @@ class Term(NamedTuple):
     indices: Int[np.ndarray, "m k"]
     """Vertices of the elements."""
     energy: Callable[[Corners, Any], Float[Array, ""]]
-    """(positions x[k][i] of one element's vertices, its data) -> J. The positions are scalars (`Corners`), whose
-    arithmetic fuses over all elements, unlike slices and stacks of arrays. With `weights`, combinations of them."""
+    """(positions x[k][i] of one element's vertices, its data) -> J. The positions are scalars (`Corners`): scalar
+    arithmetic fuses over all elements, unlike slices and stacks of arrays. With `weights`, the energy takes
+    combinations of them."""
     parameters: Any
     """Default parameters: a NamedTuple of arrays, SI units."""
     prepare: Callable[[Any, Context], Any]
@@ -70,13 +71,13 @@ class Term(NamedTuple):
     unrolled: bool = True
     """False if the energy takes an array [k, dim] instead of scalars: compiles faster beyond a dozen unknowns."""
     control: tuple[int, ...] | None = None
-    """Shape of the control that the preparation reads from its context; `None` for a term without control."""
+    """Shape of the control that `prepare` reads from its context; `None` without control."""
     lagged: bool = False
-    """Whether the preparation reads `Context.lag`."""
+    """True if `prepare` reads `Context.lag`."""
     mesh: Mesh | None = None
-    """Mesh that the term was made for, if any; the scene must have the same."""
+    """Mesh of the term, if any; the scene must have the same mesh."""
     weights: Callable[[Any], Any] | None = None
-    """Data of one element -> w[k][j], if the energy takes y[i][j] = sum over vertices k of x[k][i] w[k][j] (rows of a
+    """Data of one element -> w[k][j], for an energy of y[i][j] = sum over vertices k of x[k][i] w[k][j] (rows of a
     deformation gradient, an edge) instead of positions. The Hessian then compiles and runs faster."""
 
 
@@ -113,7 +114,7 @@ def value_or_control(
     """Returns a parameter, or in place of `None` the control of the term (a number as [] or [1]).
 
     Raises:
-        InputError: the control is missing or has another shape; the message explains it.
+        InputError: the control is missing or has another shape; the message states its meaning.
     """
     if value is not None:
         return value

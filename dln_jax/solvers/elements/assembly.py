@@ -28,7 +28,7 @@ class Pattern(NamedTuple):
     width: int
     """b."""
     free: Bool[np.ndarray, "n b"]
-    """Unknowns that are solved for."""
+    """True for the unknowns to solve for."""
     rows: Int[np.ndarray, " entries"]
     columns: Int[np.ndarray, " entries"]
     """Row and column of every entry of the Hessian; columns <= rows."""
@@ -52,7 +52,7 @@ def pattern(energies: Sequence[ElementEnergy], blocks: int, width: int, free: An
         energies: terms of the sum, with their indices.
         blocks: n.
         width: b.
-        free: [n, b], which unknowns are solved for; all of them by default.
+        free: [n, b], True for the unknowns to solve for (default: all).
 
     Raises:
         InputError: an index is out of range, or occurs twice in an element.
@@ -99,8 +99,8 @@ def assemble(corners: Int[np.ndarray, "n b valence"], components: Float[Array, "
     if corners.shape[2] == 1 and np.array_equal(corners[:, :, 0].T.ravel(), np.arange(components.size)):
         return components.T.reshape(corners.shape[:2])
     padding = components.size
-    # The unknown to which each component is added: the transposed map gathers from there. JAX's own transpose would
-    # scatter, which costs a loop iteration per element on a CPU.
+    # The transposed map gathers from the unknown of each component. JAX's own transpose would scatter, which costs a
+    # loop iteration per element on a CPU.
     unknown, slot = np.divmod(np.flatnonzero(corners.reshape(-1) < padding), corners.shape[2])
     to = np.empty(padding, int)
     to[corners.reshape(-1, corners.shape[2])[unknown, slot]] = unknown
@@ -108,9 +108,9 @@ def assemble(corners: Int[np.ndarray, "n b valence"], components: Float[Array, "
     def add(flat: Array) -> Array:
         return jnp.append(flat, 0)[corners].sum(-1).reshape(-1)
 
-    # y = G x, whose transpose should be a gather too, is written as the second half of the solution of
-    #     [[1, 0], [-G, 1]] (u, w) = (x, 0),    with the transposed solution u = x + Gᵀ w,
-    # because JAX lets callers define the transpose of a linear solve, and can batch it.
+    # The transpose of y = G x should also be a gather. So y is written as the second half of the solution of [[1, 0],
+    # [-G, 1]] (u, w) = (x, 0),    with the transposed solution u = x + Gᵀ w, because JAX lets callers define the
+    # transpose of a linear solve, and can batch it.
     def product(both: Array) -> Array:
         return jnp.concatenate([both[:padding], both[padding:] - add(both[:padding])])
 
@@ -166,5 +166,5 @@ def _require_indices(indices: np.ndarray, blocks: int, number: int) -> None:
     twice = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
     if len(twice):
         raise InputError(
-            f"element {twice[0]} of energy {number} has indices {indices[twice[0]]}; expected no index twice"
+            f"element {twice[0]} of energy {number} has indices {indices[twice[0]]}; expected each index at most once"
         )

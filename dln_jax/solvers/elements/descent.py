@@ -2,9 +2,9 @@
 
     H p = -g,    x <- x + t p
 
-The true Hessian is used. Element Hessians are projected to positive semi-definite ones only if its factorisation fails,
-those of moving elements first: always projecting costs several times the iterations on badly deformed bodies, and ten
-times on bodies that are pressed together. Moving elements also limit the steps.
+The search uses the true Hessian. It makes element Hessians positive semi-definite only if the factorisation fails,
+first those of the moving elements. Always projecting takes several times as many iterations on badly deformed bodies,
+and ten times as many on bodies pressed together. Moving elements also limit the steps.
 """
 
 from collections.abc import Callable
@@ -34,10 +34,10 @@ _ROUNDING_UNITS = 16
 # Shifts of the projected Hessian's diagonal, relative to the largest diagonal entry of an element, tried in turn: even
 # projected elements may add up to a singular matrix. They change the search directions, not the minimum.
 _SHIFTS = (1e-6, 1e-3, 1.0)
-# Sufficient decrease of the line search (Armijo), and how often it halves the step.
+# Sufficient decrease (Armijo) and largest number of halvings of the line search.
 _DECREASE = 1e-4
 _HALVINGS = 40
-# How often a step whose list of elements overflows is shortened, eightfold.
+# How many times a step is shortened eightfold if its list of elements overflows.
 _SHORTENINGS = 6
 
 
@@ -66,7 +66,7 @@ class _MinimumIterate(NamedTuple):
     iterations: Int[Array, ""]
     stuck: Bool[Array, ""]
     gap: Blocks | None
-    """Distance of fixed unknowns from the values that they approach; `None` without moving elements."""
+    """Distance of fixed unknowns from their target values; `None` without moving elements."""
 
 
 def descend(
@@ -138,11 +138,11 @@ def descend(
 def _direction(
     total: Sum, state: _MinimumIterate, hessians: tuple[Array, ...], values: Array, of_moving: tuple[Array, ...]
 ) -> tuple[Blocks, Array]:
-    """Returns Newton's direction, and whether it must be taken even if it raises the energy."""
+    """Returns Newton's direction, and whether to take it even if it raises the energy."""
     _, at, solver, moving = total
     gradient = state.point.gradient
     if state.gap is not None:
-        # Fixed unknowns move by their gap; the free ones respond as the linearised forces say.
+        # Fixed unknowns move by their gap; the free unknowns respond to the linearised forces.
         response = summed_products(total.energies, at, tuple(map(square, hessians)), state.gap)
         response += moving_products(state.lists, of_moving, state.gap)
         gradient += jnp.where(at.free, response, 0)
@@ -197,7 +197,7 @@ def _allowed(total: Sum, x: Blocks, direction: Blocks, data: Any, lists: Lists) 
     lists, fraction, _ = jax.lax.while_loop(too_many, shorten, (lists, one, jnp.asarray(0)))
     step = fraction * direction
     fractions = [m.longest(x, step, at, of) for m, at, of in zip(total.moving, lists, data[1], strict=True)]
-    # If elements were left out, no step is known to be allowed.
+    # With elements left out, no step is known to be safe.
     return lists, jnp.where(overflow(lists), 0.0, fraction * jnp.min(jnp.stack([one, *fractions])))
 
 
@@ -222,18 +222,18 @@ def _line_search(
 ) -> tuple[Evaluated, Float[Array, ""]]:
     """Takes the first of the steps l, l/2, l/4, ... that lowers the energy, or the gradient if rounding hides that.
 
-    Changes of the energy below `unclear` are rounding of terms that cancel at rest; the gradient of a stiff body keeps
-    improving by many digits beyond that. Returns point and step length, or the start and 0 if no step is accepted.
+    Energy changes below `unclear` are rounding errors of cancelling terms. The gradient of a stiff body still improves
+    by many digits then. Returns point and step length, or the start and 0 if no step is accepted.
 
     Args:
         evaluate: x -> energy and gradient.
         start: the point where the search starts.
         direction: a descent direction.
         slope: derivative of the energy along the direction, <= 0.
-        unclear: size of energy changes that rounding hides.
+        unclear: energy changes below it are lost in rounding.
         scale: unit of the gradient's rows.
         longest: the first length l.
-        any_change: whether to accept any step to a finite energy.
+        any_change: accept any step to a finite energy.
     """
 
     def size(gradient: Blocks) -> Array:

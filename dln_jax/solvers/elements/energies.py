@@ -3,7 +3,7 @@
     E(x) = sum over energies, sum over elements e:  energy(x[indices[e]], data[e]),    x [n, b]
 
 An element couples a few of the n blocks of b unknowns (the corners of a triangle, the ends of a spring), so the Hessian
-is sparse; `assembly` puts it together.
+is sparse. `assembly` adds up the elements.
 """
 
 import functools
@@ -17,9 +17,9 @@ from jaxtyping import Array, Float, Int
 
 from dln_jax.solvers.elimination import cholesky, symmetric_eigen
 
-# Largest number of elements that are decomposed at a time.
+# Largest number of elements decomposed at a time.
 _DECOMPOSED = 64
-# Largest element Hessians that are projected in one batch.
+# Largest element Hessians projected in one batch.
 _SMALL = 36
 
 Blocks = Float[Array, "n b"]
@@ -35,11 +35,11 @@ class ElementEnergy(NamedTuple):
     indices: Int[np.ndarray, "m k"]
     """Blocks of unknowns of every element; a block occurs at most once per element."""
     unrolled: bool = False
-    """Whether the energy takes scalars (`Corners`) instead of an array [k, b]. Scalar arithmetic fuses over all
-    elements, which makes derivatives several times faster for elements of up to a dozen unknowns."""
+    """True if the energy takes scalars (`Corners`) instead of an array [k, b]. Scalar arithmetic fuses over all
+    elements, so derivatives are several times faster for elements of up to a dozen unknowns."""
     weights: Callable[[Any], Any] | None = None
-    """Data of one element -> w[k][j], if the energy takes the combinations y[i][j] = sum over corners k of x[k][i]
-    w[k][j], such as a deformation gradient or an edge: its Hessian by these is smaller. Only if unrolled."""
+    """Data of one element -> w[k][j], for an energy of the combinations y[i][j] = sum over corners k of x[k][i]
+    w[k][j], such as a deformation gradient or an edge. The Hessian by y is smaller. Only if unrolled."""
 
 
 def value(energies: Sequence[ElementEnergy], x: Blocks, data: Sequence[Any]) -> Float[Array, ""]:
@@ -84,7 +84,7 @@ def combinations(x: Corners, weights: Any) -> list[list[Array]]:
 
 
 def local(element: ElementEnergy, x: Blocks) -> Any:
-    """Returns the unknowns of all elements in the form that the energy takes: [m, k, b], or nested tuples of [m]."""
+    """Returns the unknowns of all elements as the energy takes them: [m, k, b], or nested tuples of [m]."""
     if not element.unrolled:
         return x[element.indices]
     corners = (_take(x, corner) for corner in element.indices.T)
@@ -163,8 +163,8 @@ def _take(x: Blocks, blocks: np.ndarray) -> Float[Array, "m b"]:
 def project(hessians: Sequence[Array], shift: Float[Array, ""]) -> tuple[Array, ...]:
     """Sets negative eigenvalues of element Hessians (lower triangles) to zero, and shifts their diagonals.
 
-    `shift` is relative to the largest diagonal entry of all elements. An element whose Hessian is positive definite
-    with half of the shift keeps it; only the others are decomposed.
+    `shift` is relative to the largest diagonal entry of all elements. An element keeps its Hessian if half of the shift
+    makes it positive definite; only the others are decomposed.
     """
     whole = [jnp.where(jnp.isfinite(h), h, 0) for h in map(square, hessians)]
     largest = functools.reduce(jnp.maximum, [jnp.max(jnp.diagonal(h, axis1=1, axis2=2), initial=0) for h in whole])
@@ -188,7 +188,7 @@ def _projected(hessians: Float[Array, "m s s"], shift: Float[Array, ""]) -> Floa
     count = min(_DECOMPOSED, m)
     unit = jnp.eye(s, dtype=hessians.dtype)
     definite = jnp.isfinite(jax.vmap(cholesky)(hessians + shift / 2 * unit)).all(axis=(1, 2))
-    # Places of the others first; places past the end read the last element and are not written.
+    # Elements to decompose come first. Places past the end read the last element and are not written.
     order = jnp.append(jnp.argsort(definite), jnp.full(count, m))
 
     def decompose(number: Array, hessians: Array) -> Array:

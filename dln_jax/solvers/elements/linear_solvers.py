@@ -1,16 +1,16 @@
-"""Solves symmetric positive definite systems H p = b whose matrix is a sum of element Hessians.
+"""Solves symmetric positive definite systems H p = b, with H a sum of element Hessians.
 
-There are four methods; `least_work` chooses one before tracing, by the operations that it takes:
+There are four methods. `least_work` chooses one before tracing, by its number of operations:
 
 - `dense` Cholesky for small systems;
 - `block_tridiagonal` Cholesky after reverse Cuthill-McKee ordering, a `lax.scan` over blocks, for narrow bands: bodies
   in the plane, and small or long ones in space;
-- `sparse` Cholesky by tiles after nested dissection for other systems, whatever their stiffness;
+- `sparse` Cholesky by tiles after nested dissection for other systems of any stiffness;
 - `matrix_free` conjugate gradients with a block-Jacobi preconditioner on the element Hessians, for soft bodies in small
-  time steps, and for systems whose factor would not fit into memory.
+  time steps, and for systems with too large a factor for the memory.
 
-Stiffness, Poisson's ratio, time step and mesh together determine how many products conjugate gradients need for a
-search direction; it grows with the square root of the condition number, and can be counted for known values only.
+The number of products in conjugate gradients depends on stiffness, Poisson's ratio, time step and mesh. It grows with
+the square root of the condition number, and can be counted for known values only.
 
 If the matrix is not positive definite, the solution is not finite: there are no shifts and no clamping.
 """
@@ -55,14 +55,14 @@ _SEARCH_RESIDUAL = 1e-2
 _UPPER_PRODUCTS = 10_000
 # With more unknowns the dense factorisation is slower than the block-tridiagonal one.
 _DENSE_UNKNOWNS = 160
-# Small blocks are slower for each operation, as if a block had this many more rows.
+# Operations on small blocks are slower, as if a block had this many more rows.
 _BLOCK_OVERHEAD = 150
 # Operations of a factorisation that take as long as an entry of the element Hessians in a product, which reads it from
 # memory; an inexact search also needs 1.75 times the Newton iterations.
 _OPERATIONS_OF_ENTRY = 16
-# So few products gain little, and counting them costs a compilation.
+# With so few products there is little to gain, and counting them costs a compilation.
 _LOWER_PRODUCTS = 20
-# Largest numbers of entries of the blocks of a band, and of the tiles, whose places are 32-bit numbers.
+# Largest numbers of entries in the blocks of a band, and in the tiles (32-bit indices).
 _UPPER_ENTRIES = 3e7
 _UPPER_TILE_ENTRIES = 5e8
 
@@ -71,7 +71,7 @@ class LinearSolver(NamedTuple):
     """A method for systems with the Hessian."""
 
     factorise: Callable[[Sequence[Array], Any], Any]
-    """(element Hessians, entries of their sum [entries], or what `with_moving` expects) -> factor for the solves."""
+    """(element Hessians, entries of their sum [entries], or the tuple of `with_moving`) -> factor for the solves."""
     solve: Callable[[Any, Blocks], Blocks]
     """(factor, b) -> p, accurate to rounding; p is zero where the pattern is not free."""
     search: Callable[[Any, Blocks], Blocks]
@@ -177,7 +177,7 @@ def sparse(_: Sequence[ElementEnergy], at: Pattern, *, tables: sparse_cholesky.P
 def matrix_free(energies: Sequence[ElementEnergy], at: Pattern, *, products: int = _UPPER_PRODUCTS) -> LinearSolver:
     """Solves by conjugate gradients with a block-Jacobi preconditioner, on products with the element Hessians.
 
-    A solution that misses its relative residual after `products` products is not finite.
+    The solution is not finite if it misses its relative residual after `products` products.
     """
     n, b = at.blocks, at.width
     numbers = np.arange(n * b).reshape(n, b)
@@ -284,7 +284,7 @@ def lookup(at: Pattern) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
 
     def places(row: np.ndarray, column: np.ndarray) -> np.ndarray:
         row, column = np.broadcast_arrays(row, column)
-        # The lower triangle serves for both.
+        # Both triangles use the entries of the lower one.
         wanted = np.maximum(row, column) * size + np.minimum(row, column)
         nearest = np.minimum(np.searchsorted(key[order], wanted), len(key) - 1)
         place = np.where(key[order][nearest] == wanted, order[nearest], len(key))

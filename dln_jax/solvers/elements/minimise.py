@@ -3,9 +3,9 @@
     x* = argmin E(x; theta),    H p = -g,    x <- x + t p                      (Newton with a line search)
     dx* = -H⁻¹ (dg/dtheta) dtheta,    g = dE/dx,    H = d²E/dx²                (implicit function theorem)
 
-The iterations are in `descent`. The derivative is that of the minimum, not of the iterations: it takes one
-factorisation and one solve, in forward and reverse mode and to any order. At a point that is not a minimum the
-derivative is NaN, never a plausible number.
+The iterations are in `descent`. The derivative is exact at the minimum and does not run through the iterations. It
+takes one factorisation and one solve, in forward and reverse mode and to any order. At a point that is not a minimum it
+is NaN, never a plausible number.
 """
 
 import functools
@@ -50,24 +50,24 @@ def minimise(
 ) -> tuple[Blocks, SolverInfo]:
     """Returns the x [n, b] near x0 that minimises the sum of the energies, and the outcome of the search.
 
-    Derivatives are those of the minimum by `data` and by entries of x0 that are not free, not by closed-over arrays.
+    The minimum can be differentiated by `data` and by the fixed entries of x0, not by closed-over arrays.
 
     Args:
         energies: the terms of the sum, or one function (x [n, b], data) -> scalar of all unknowns.
         x0: start [n, b]; float32 or float64 decides the precision.
         data: for every energy, the data of its elements (leading axis m); for one function, its second argument.
-        free: [n, b], which unknowns are solved for (default: all); the others keep their value in x0.
+        free: [n, b], True for the unknowns to solve for (default: all); the others keep their value in x0.
         scale: positive unit of the gradient's rows, [n] or a number; with masses the residual is an acceleration.
         tolerance: largest |dE/dx| / scale that counts as a minimum; a gradient at the level of rounding always does.
         iterations: largest number of Newton steps; see `SolverInfo.converged`.
         linear_solver: `by_size`, or one of `solvers.elements.linear_solvers`: `dense`, `block_tridiagonal`,
             `sparse`, `matrix_free`. Moving energies have their own solver.
         at: the energies' pattern, if already computed.
-        definite: also report `SolverInfo.definite`, at the cost of another Hessian, factorisation and accurate solve.
-        moving: further energies, whose elements change with x and which limit the steps.
+        definite: also report `SolverInfo.definite`, which takes another Hessian, factorisation and accurate solve.
+        moving: further energies of elements that change with x; they limit the steps.
         moving_data: the data of these energies.
-        start: start [n, b] that the moving energies allow, if x0 is not allowed; unknowns that are not free approach
-            their values in x0 as far as these energies allow. It has no derivatives.
+        start: start [n, b] with finite moving energies, if x0 has none. Fixed unknowns approach their values in x0 as
+            far as these energies allow. It has no derivatives.
 
     Raises:
         InputError: indices, shapes or settings are invalid.
@@ -105,7 +105,7 @@ def minimise(
 
 
 def is_constant(tangent: Any) -> bool:
-    """Whether a tangent is known to be zero, in a rule with symbolic zeros."""
+    """Returns whether a tangent is known to be zero, in a rule with symbolic zeros."""
     return isinstance(tangent, SymbolicZero) or getattr(tangent, "dtype", None) == jax.dtypes.float0
 
 
@@ -121,7 +121,7 @@ def _lists_of(info: SolverInfo) -> Lists:
 
 def _implicit_derivative(total: Sum, x: Blocks, data: Any, lists: Lists, x0_dot: Any, data_dot: Any) -> Blocks:
     at, solver = total.at, total.solver
-    # Constant data are left out: their derivatives would only be multiplied by zero.
+    # Constant data are left out, because their derivatives would be multiplied by zero.
     leaves, structure = jax.tree.flatten(data)
     dots = jax.tree.leaves(data_dot, is_leaf=is_constant)
     varying = [i for i, dot in enumerate(dots) if not is_constant(dot)]

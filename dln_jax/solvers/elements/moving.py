@@ -1,11 +1,11 @@
-"""Sums of element energies whose elements are not known before tracing, such as pairs of primitives in contact.
+"""Sums of element energies over elements that change with the unknowns, such as pairs of primitives in contact.
 
 An energy of moving elements is a function of a few blocks of unknowns, as in `energies`, but the blocks depend on the
-unknowns. It lists all elements that may act between two points, in a list of fixed capacity, and limits how far a step
-may go. Given such a list, the elements are fixed, and so they are in derivatives.
+unknowns. It lists all elements that may act between two points, with a fixed capacity, and limits the step. The
+elements of a list are fixed, also in derivatives.
 
-Systems with their Hessians are solved densely, or by conjugate gradients preconditioned with the factor of the static
-elements and the diagonal blocks of the moving ones, with at most about as many iterations as acting elements.
+Their systems are solved densely or by conjugate gradients. The preconditioner is the factor of the static elements with
+the diagonal blocks of the moving elements. It takes about as many iterations as there are acting elements, or fewer.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +24,7 @@ from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients
 from dln_jax.solvers.elimination import cholesky, substitute, symmetric_eigen
 
 _DENSE_UNKNOWNS = 1000
-"""Largest systems that are solved densely: a factorisation of this size takes about as long as assembling it."""
+"""Largest system solved densely: its factorisation takes about as long as its assembly."""
 _SOLVE_RESIDUAL = 1e-11
 _SEARCH_RESIDUAL = 1e-4
 _UPPER_PRODUCTS = 3000
@@ -38,7 +38,7 @@ class Elements(NamedTuple):
     data: Any
     """Further data of the elements, without derivatives: a pytree with leading axis `capacity`."""
     overflow: Bool[Array, ""]
-    """Whether elements had to be left out."""
+    """True if elements had to be left out."""
 
 
 class MovingEnergy(NamedTuple):
@@ -66,7 +66,7 @@ def lists_between(moving: Sequence[MovingEnergy], x: Blocks, step: Blocks, data:
 
 
 def overflow(lists: Lists) -> Bool[Array, ""]:
-    """Whether any list was too short."""
+    """Returns whether any list was too short."""
     return jnp.stack([jnp.asarray(False), *(elements.overflow for elements in lists)]).any()
 
 
@@ -132,7 +132,7 @@ def with_moving(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
 
 
 def project_moving(hessians: Float[Array, "capacity s s"]) -> Float[Array, "capacity s s"]:
-    """Sets negative eigenvalues to zero, one acting element after the other: there are few."""
+    """Sets negative eigenvalues to zero, one acting element after the other, because few act."""
     hessians = jnp.where(jnp.isfinite(hessians), hessians, 0)
     acting = (hessians != 0).any(axis=(1, 2))
     order = jnp.argsort(~acting)

@@ -1,16 +1,16 @@
 """Cholesky factorisation of a sparse matrix, H = L Lᵀ, by square tiles after nested dissection.
 
-A separator splits the graph of the matrix into two parts that do not touch; the parts are split in turn, and every
-separator is eliminated after the parts on both its sides (George 1973). Distances in the graph from a few distant
-vertices serve as coordinates. Across the longest axes of a part, the smallest separator within a band around the middle
-is a minimum cut (maximum flow) with unit capacity per vertex. Vertices of a separator are ordered along its own longest
-axes, so that a part touches few of its tiles.
+A separator splits the graph of the matrix into two parts that do not touch. The parts are split in turn, and every
+separator is eliminated after both of its parts (George 1973). Graph distances from a few distant vertices serve as
+coordinates. The separator is the minimum cut (maximum flow, unit capacity per vertex) within a band around the middle
+of the part's longest axes. The vertices of a separator are ordered along its own longest axes, so that a part touches
+few of its tiles.
 
-Only the tiles of L that are not zero are stored. They are computed column after column, from the columns before:
+Only non-zero tiles of L are stored. They are computed column by column:
 
     L_jj L_jjᵀ = H_jj - sum over k < j of L_jk L_jkᵀ,    L_ij L_jjᵀ = H_ij - sum over k < j of L_ik L_jkᵀ
 
-The plan has the loops' lengths: one compiled body serves all tiles.
+The plan holds the lengths of the loops, so one compiled body serves all tiles.
 """
 
 from typing import NamedTuple
@@ -27,10 +27,10 @@ from dln_jax.solvers.elimination import cholesky, substitute
 
 # Rows of a tile: a multiple of the 2 or 3 unknowns of a vertex.
 TILE = 48
-# Number of distant vertices whose distances are the coordinates, and of axes that are tried.
+# Number of distant vertices for the coordinates, and number of axes to try.
 _LANDMARKS = 12
 _AXES = 2
-# Smallest share of the vertices that a part keeps; the band of possible separators lies between the parts.
+# Smallest share of the vertices in a part; possible separators lie between the parts.
 _SMALLEST_PART = 0.36
 
 Numbers = Int[np.ndarray, " number"]
@@ -173,7 +173,7 @@ def dissect(graph: csr_array, tile: int) -> list[np.ndarray]:
 
     Args:
         graph: symmetric, with positive entries off the diagonal and none on it.
-        tile: number of vertices whose unknowns fill a tile; parts of up to four tiles are not split.
+        tile: number of vertices that fill a tile; parts of up to four tiles are not split.
     """
     groups: list[np.ndarray] = []
 
@@ -216,7 +216,7 @@ def _along_axes(points: Points) -> Float[np.ndarray, "axes n"]:
 
 
 def _by_tiles(vertices: np.ndarray, points: Points, tile: int) -> np.ndarray:
-    """Returns vertices such that those of a tile are near one another: halves along the longest axis, in turn."""
+    """Returns vertices in an order that puts neighbours into one tile, by halving along the longest axis."""
     if len(vertices) <= tile:
         return vertices
     order = np.argsort(_along_axes(points)[0], kind="stable")

@@ -5,8 +5,8 @@ Block-tridiagonal matrices are factorised by a scan over the blocks:
     H = [[D_0, C_1ᵀ, ...], [C_1, D_1, C_2ᵀ, ...], ...],    H = L Lᵀ with diagonal blocks L_i and blocks W_i below them:
     L_i L_iᵀ = D_i - W_i W_iᵀ,    W_i L_{i-1}ᵀ = C_i
 
-Many narrow-band systems A x = b, A = L Lᵀ, are solved side by side: a few hundred operations per unknown are too few
-for one library call per system. Every number is a vector over the systems (the last axis), so that a loop over the
+Many narrow-band systems A x = b, A = L Lᵀ, are solved side by side, because a library call per system costs more than
+its few hundred operations per unknown. Every number is a vector over the systems (the last axis), so a loop over the
 columns works on long vectors. Unknowns are taken in pairs:
 
     X_J = A_J - sum over P >= 1 of L_{J-P} (L_{J-P}'s pair at J)ᵀ,    L_JJ L_JJᵀ = X_JJ,    L_IJ = X_IJ L_JJ⁻ᵀ
@@ -28,7 +28,7 @@ Vector = Float[Array, "..."]
 Factor = tuple[Float[Array, "count s s"], Float[Array, "count s s"]]
 """(L_i, W_i); W_0 is zero."""
 PAIR = 2
-"""Unknowns per step of the loop; the fastest of 1 to 4, measured on two cores with 4 to 64 systems."""
+"""Unknowns per step of the loop. Fastest of 1 to 4, measured on two cores with 4 to 64 systems."""
 
 Columns = Float[Array, "pairs rows 2 systems"]
 """Pairs of columns of the lower triangle: [J, r, c] is the entry (2 J + r, 2 J + c)."""
@@ -106,7 +106,7 @@ def conjugate_gradients(
         return x, r, z + (next_rz / rz) * p, next_rz, count + 1, curvature > 0
 
     z = precondition(b)
-    # A right-hand side that is not finite ends the loop at once, because comparisons with NaN are false.
+    # A non-finite right-hand side ends the loop at once, because comparisons with NaN are false.
     last = jax.lax.while_loop(more, iterate, (jnp.zeros_like(b), b, z, jnp.vdot(b, z), 0, jnp.asarray(True)))
     x, r, _, _, _, definite = last
     solved = definite & (jnp.linalg.norm(r.reshape(-1)) <= enough)
@@ -129,7 +129,7 @@ def solve_bands(lower: Columns, b: Float[Array, "unknowns k systems"]) -> Float[
     """Returns x with A x = b for all systems; not finite for a matrix that is not positive definite.
 
     Args:
-        lower: entries of A at `places`; those beyond the matrix are those of the unit matrix.
+        lower: entries of A at `places`; beyond the matrix, entries of the unit matrix.
         b: k right-hand sides of every system.
     """
     count, rows, _, systems = lower.shape

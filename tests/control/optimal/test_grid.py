@@ -113,7 +113,7 @@ def test_value_with_ridges_converges_to_what_its_policy_costs():
 def test_too_few_improvements_are_not_converged():
     found = solve_on_grid(LINEAR, (17,), low=[-3, -3], high=[3, 3], limit=8.0, improvements=1)
     assert not found.converged
-    assert reason(found.ending).startswith("used up its iterations")
+    assert reason(found.ending).startswith("ran out of iterations")
 
 
 def test_a_step_and_its_cost():

@@ -92,7 +92,7 @@ def test_problems_and_networks_that_contradict_themselves_are_refused():
         ({"high": -HIGH}, "the box is from"),
         ({"low": np.zeros(3)}, "have shapes"),
         ({"discount": -1.0}, "discount is -1.0"),
-        ({"state_cost": lambda x: 1.0 + x @ x}, "a second at the goal costs 1"),
+        ({"state_cost": lambda x: 1.0 + x @ x}, "the goal costs 1 per second"),
         ({"joints": ("revolute",) * 5}, "5 joints"),
     ):
         with one_line(message):

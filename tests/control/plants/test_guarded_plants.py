@@ -123,7 +123,7 @@ def test_layouts_that_contradict_themselves_are_refused():
         ({"speed": -1.0}, "speed is"),
         ({"late": 1.0}, "late is 1.*expected more than 1"),
         ({"actuated": []}, "no joint has a motor"),
-        ({"actuated": [0, 1]}, "none is passive"),
+        ({"actuated": [0, 1]}, "all 2 joints have a motor"),
         ({"actuated": [2]}, "from 0 to 1"),
     ):
         with one_line(message):

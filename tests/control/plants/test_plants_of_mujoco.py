@@ -63,7 +63,7 @@ WRONG_LINKS = [
     ({"actuated": [2]}, "no joint '2'"),
     ({"actuated": [0, 1]}, "all 2 joints have a motor"),
     ({}, "no joint has a motor: the file has no actuator"),
-    ({"actuated": [1], "control": None}, "states no limit of the motor of joint 'elbow'"),
+    ({"actuated": [1], "control": None}, "has no limit for the motor of joint 'elbow'"),
     ({"source": TWO_LINKS.replace('axis="0 1 0"', 'axis="0 0 1"'), "actuated": [0]}, "gravity does not move the pass"),
     ({"source": f"<mujoco><worldbody><body><joint/>{ROD}</body></worldbody></mujoco>"}, "has 1 joint"),
 ]

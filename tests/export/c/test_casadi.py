@@ -126,12 +126,12 @@ REFUSED = {
     "three axes": (lambda x: x.sum(), [np.ones((2, 2, 2))], {}, "x is real of shape .2, 2, 2.; CasADi takes"),
     "a result of three axes": (lambda x: jnp.ones((1, 1, 1)) * x, [np.float64(1)], {}, "result is real of shape"),
     "integers": (lambda k: 2 * k, [np.int32(1)], {}, "k is int"),
-    "empty": (lambda x: jnp.ones(2), [np.ones(0)], {}, "none of them empty"),
+    "empty": (lambda x: jnp.ones(2), [np.ones(0)], {}, "non-empty axes"),
     "no arguments": (lambda: jnp.ones(2), [], {}, "no arguments to differentiate"),
     "single precision": (lambda x: x, [np.ones(2)], {"precision": "f32"}, "CasADi computes in double"),
-    "a name for itself": (lambda hess: hess, [np.ones(2)], {}, "CasADi has no such name as hess"),
+    "a name for itself": (lambda hess: hess, [np.ones(2)], {}, "CasADi does not accept the name hess"),
     "two underscores": (lambda x: x, [np.ones(2)], {"name": "my__arm"}, "my__arm_f"),
-    "a name twice": (lambda a, out_a: {"y": a}, [np.ones(2)] * 2, {}, "name as out_a"),
+    "a name twice": (lambda a, out_a: {"y": a}, [np.ones(2)] * 2, {}, "the name out_a"),
 }
 
 
@@ -140,7 +140,7 @@ def test_what_casadi_cannot_take_is_refused(tmp_path):
         with one_line(message):
             export_c({"f": (function, examples)}, tmp_path / "c", casadi=True, **keywords)
     assert not (tmp_path / "c").exists()
-    with one_line(r"^casadi_m_f: it would take 4 KiB of stack; .* up to 2 KiB; export it without casadi$"):
+    with one_line(r"^casadi_m_f: it needs 4 KiB of stack; the limit is 2 KiB; export it without casadi$"):
         external_c.external_functions("m", {"f": (jnp.tanh, [np.ones(500)])}, Source("f64"), stack=2048)
 
 

@@ -128,7 +128,7 @@ def test_functions_of_the_c_library_bear_extended_precision(tmp_path):
 def test_cmake_builds_library_and_demo(tmp_path):
     export_c(FUNCTIONS, tmp_path, name="swing")
     # One folder per export: a second one would need a CMake file of its own.
-    with pytest.raises(InputError, match=r"holds CMakeLists\.txt already"):
+    with pytest.raises(InputError, match=r"already contains CMakeLists\.txt"):
         export_c(FUNCTIONS, tmp_path, name="other")
     for arguments in (["-S", ".", "-B", "build", "-DDLN_OWN_ELEMENTARY=ON"], ["--build", "build"]):
         subprocess.run(["cmake", *arguments], cwd=tmp_path, check=True, capture_output=True)
@@ -187,7 +187,7 @@ def test_a_kill_leaves_an_old_export_or_a_new_one_or_a_refusal(tmp_path, monkeyp
         try:
             source = interface.read_interface(folder, "model")[2]["model.c"]
         except InputError as error:
-            assert 0 < renamed < total and "is altered, renamed or of another export" in str(error)
+            assert 0 < renamed < total and "is altered, renamed or from another export" in str(error)
         else:
             assert source == (after if renamed == total else before)["model.c"]
 
@@ -227,7 +227,7 @@ def test_a_changed_description_is_refused(exported, tmp_path):
     for there, changed in CHANGES:
         assert there in exported["model.json"]
         (tmp_path / "model.json").write_bytes(exported["model.json"].replace(there, changed, 1))
-        with one_line(r"model\.c is altered, renamed or of another export"):
+        with one_line(r"model\.c is altered, renamed or from another export"):
             load_c(tmp_path)
     for name, data in exported.items():
         (tmp_path / name.replace("model", "arm")).write_bytes(data)

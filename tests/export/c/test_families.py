@@ -308,9 +308,9 @@ def test_mistakes_are_named():
         "a structured-delan has no sped, value; choose from inverse_dynamics, ": lambda: functions_of_run(
             run, precision="f64", names=["sped", "gravity", "value"]
         ),
-        "which float32 cannot hold": lambda: functions_of_run(large, precision="f32"),
+        "beyond the range of float32": lambda: functions_of_run(large, precision="f32"),
         "precision is 'f16'": lambda: functions_of_run(run, precision="f16"),
-        "a user-defined model is exported in f64": lambda: functions_of_run(own, precision="f32"),
+        "in its training precision, f64": lambda: functions_of_run(own, precision="f32"),
         "iterations is 0": lambda: system(iterations=0),
     }
     for message, call in cases.items():

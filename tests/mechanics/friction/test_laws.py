@@ -98,13 +98,13 @@ def test_what_are_no_laws_and_no_coefficients_is_refused():
     for laws, message in [
         (["viscous", "dahl"], "laws has 'dahl'; expected some of viscous, coulomb, stribeck,"),
         (["viscous", "viscous"], "expected each law once"),
-        (["asymmetric", "coulomb"], "asymmetric and coulomb, which no data can tell apart; leave one out"),
+        (["asymmetric", "coulomb"], "asymmetric and coulomb, and no data can tell them apart; leave coulomb out"),
         ([["viscous"]], "expected some of"),
     ]:
         with one_line(message):
             require_laws(laws, "laws")
     for options, message in [
-        ({"viscous": -0.1}, "viscous is -0.1; expected finite numbers, none of them negative"),
+        ({"viscous": -0.1}, "viscous is -0.1; expected finite numbers of at least 0"),
         ({"coulomb": [0.1, np.nan]}, "coulomb is"),
         ({"offset": np.inf}, "offset is inf; expected finite numbers$"),
         ({"coulomb": 0.1, "velocity_scale": 0.0}, "velocity_scale is 0.0; expected a positive number"),

@@ -60,11 +60,11 @@ def test_motors_and_armature_are_converted_back_and_forth():
 def test_invalid_motors_are_refused():
     arm = serial(*FRAMES, LINKS, armature=A)
     for make, message in (
-        (lambda: require_motors(np.ones((3, 3)), (), 3), "motors is .* that can be inverted"),
-        (lambda: require_motors(None, ((1, 1),), 3), "coupled is 2:2; expected each pair of different joints"),
+        (lambda: require_motors(np.ones((3, 3)), (), 3), "motors is .* expected an invertible matrix"),
+        (lambda: require_motors(None, ((1, 1),), 3), "coupled is 2:2; expected distinct pairs i:j of joints"),
         (lambda: make_rigid_tree(arm), "armature couples joints 2 and 3, .* or couple them .--coupled 2:3"),
         (lambda: make_rigid_tree(arm, cooling=0.1), "cooling is 0.1, but friction has no law; add 'viscous'"),
-        (lambda: serial(*FRAMES, LINKS, armature=A - np.eye(3)), "armature is not a symmetric positive semidefinite"),
+        (lambda: serial(*FRAMES, LINKS, armature=A - np.eye(3)), "armature is not symmetric positive semidefinite"),
     ):
         with one_line(message):
             make()

@@ -137,7 +137,7 @@ def test_what_is_no_tree_is_refused():
         ({"joints": ("revolute", "ball")}, "joints are"),
         ({"inertias": np.ones((2, 9))}, r"inertias has shape \(2, 9\); expected \(2, 10\)"),
         ({"positions": np.full((2, 3), np.nan)}, "positions has nan at"),
-        ({"rotations": [np.eye(3), -np.eye(3)]}, "rotations has a matrix that is not a rotation"),
+        ({"rotations": [np.eye(3), -np.eye(3)]}, "rotations has an invalid matrix"),
         ({"axes": np.zeros((2, 3))}, "joint 0 has an axis of length zero"),
         ({"names": ("a", "a")}, "names are"),
     ]:

@@ -125,7 +125,7 @@ def test_refuses_what_has_no_outline_and_wrong_numbers(monkeypatch):
     for character, got in [
         (" ", "' ', an empty glyph"),
         ("ab", "'ab', a str"),
-        ("\n", "font lacks"),
+        ("\n", "not in the font"),
         (3, "3, a int"),
     ]:
         with one_line(f"{got}.*expected one printable character"):

@@ -149,7 +149,7 @@ def test_surfaces_that_cross_and_integrators_that_extrapolate_or_average_are_ref
     for refused, words in (
         (lambda: scene_of(blocks(0.1, 0.1)), "cross, the first with the vertices"),
         (lambda: make_step(scene, 0.01, MIDPOINT), "use BACKWARD_EULER"),
-        (lambda: make_step(scene, 0.01, AVERAGE_VECTOR_FIELD), "the pairs that touch change"),
+        (lambda: make_step(scene, 0.01, AVERAGE_VECTOR_FIELD), "the contact pairs change"),
     ):
         with one_line(words):
             refused()
