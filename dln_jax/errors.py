@@ -46,7 +46,18 @@ LARGEST_STATED = 1e20
 
 
 class InputError(ValueError):
-    """Invalid user input; the message states what was wrong, what was expected and what to do."""
+    """Invalid input: the message states in one line what was wrong, what was expected and what to do.
+
+    A `ValueError`. Commands print the message and end with status 2.
+
+    Example:
+        >>> import dln_jax
+        >>> try:
+        ...     dln_jax.load_trajectories("missing.npz")
+        ... except dln_jax.InputError as error:
+        ...     print(error)
+        missing.npz: no such file; give the path of the data
+    """
 
 
 class FitRefused(Exception):

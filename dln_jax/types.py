@@ -116,10 +116,19 @@ class _Needs(NamedTuple):
 
 
 class Needs(_Needs):
-    """Terms that a scene needs; a term that is absent here is never built, traced or compiled.
+    """Joints of a plant and the terms in its equations of motion.
 
-    Hashable and made of plain Python values, so that it can be a static argument and a line of JSON. Raises
-    `InputError` for unknown kinds of joints or laws of friction, and for values of a wrong type.
+    Models never build, trace or compile a term that is absent here. The record is hashable and has plain Python values,
+    so it can be a static argument of `jax.jit` and can be stored as JSON.
+
+    Raises:
+        InputError: unknown kinds of joints or laws of friction, or values of a wrong type.
+
+    Example:
+        >>> import dln_jax
+        >>> needs = dln_jax.Needs(joints=("prismatic", "revolute"), joint_friction=("viscous", "coulomb"))
+        >>> print(needs.degrees_of_freedom, needs.gravity, needs.friction)
+        2 True False
     """
 
     __slots__ = ()

@@ -105,21 +105,34 @@ def read_log(
 ) -> Log:
     """Reads, filters and checks a log: npz, CSV or a ROS bag.
 
-        log = read_log("mine.csv", robot="arm.urdf")
-
     Args:
-        path: the file, or a folder of a bag.
-        robot: the robot that moved, or its URDF or MJCF file; its joints are matched by name.
+        path: the file, or the folder of a bag.
+        robot: the robot that moved, or its URDF or MJCF file; joints are matched by name.
         rate: sampling rate of a file without t, Hz.
-        units: CSV: units of columns whose titles state none.
+        units: units of CSV columns without a unit in the title, "si" or "degrees".
         joints: joints to keep, in this order; "LOG=NAME" renames one.
-        topics: ROS bag: topics of joint states (default: the only one).
-        torque_factor: factor of tau, such as N m per A: one, one per joint, or by name.
-        known: needs, needs_origin, assume, driven, cutoff, decimate, settled and accept_log, as for `log_of`.
+        topics: topics of joint states in a ROS bag (default: the only one).
+        torque_factor: factor of tau, such as N m per A: one number, one per joint, or numbers by name.
+        known: needs, needs_origin, assume, driven, cutoff (Hz), decimate, settled and accept_log, as for `log_of`.
+
+    Returns:
+        The trajectories in SI units, with the needs of the plant, faults that the check reported, and remarks.
 
     Raises:
-        InputError: a file that is missing, damaged or of another schema; joints that are not the robot's; and as for
-            `log_of`.
+        InputError: the file is missing, damaged or breaks the schema, its joints are not the robot's, the check reports
+            an error and `accept_log` is false, or `log_of` refuses the data.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> import dln_jax
+        >>> t = np.linspace(0.0, 10.0, 201)
+        >>> rows = np.stack([t, np.sin(t), 9.81 * np.cos(np.sin(t)) - np.sin(t)], axis=1)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     np.savetxt(f"{folder}/log.csv", rows, delimiter=",", header="t [s],q [rad],tau [N m]", comments="")
+        ...     log = dln_jax.read_log(f"{folder}/log.csv")
+        >>> print(log.data.qdd.shape, log.needs.joints, log.faults)
+        (201, 1) ('revolute',) ()
     """
     if robot is not None and not isinstance(robot, Robot):
         robot = read_robot(Path(robot))

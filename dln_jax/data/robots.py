@@ -55,18 +55,34 @@ class Robot(NamedTuple):
 
 
 def read_robot(path: str | Path, *, lock: Lock = ()) -> Robot:
-    """Reads a robot from a URDF or MJCF file.
+    """Reads a robot from a URDF or MJCF file, with the extra `[robot]` (MuJoCo).
 
     URDF inertias are read as stated, even if they are not physically consistent.
 
     Args:
-        lock: joints to lock, such as those of a gripper: names (locked at zero), or positions by name, rad or m.
+        path: the URDF or MJCF file.
+        lock: joints to lock, for example in a gripper: names (locked at zero), or positions by name, rad or m.
             "*finger*" matches all names that contain finger. Bodies behind a locked joint become fixed.
+
+    Returns:
+        The tree of d joints, and viscous and dry friction, limits of position, force and velocity, [d] in SI units.
 
     Raises:
         InputError: MuJoCo is missing; the file is missing, malformed or cyclic; a joint that is not locked is neither
             revolute, continuous nor prismatic, mimics another, has a spring, or has limits that are NaN, equal,
             swapped or half stated; a joint to lock does not exist; no joint moves; or a moving link has no mass.
+
+    Example:
+        >>> import pathlib
+        >>> import tempfile
+        >>> import dln_jax
+        >>> link = '<joint name="hinge" axis="0 1 0" damping="0.1"/><geom size="0.1" mass="2" pos="1 0 0"/>'
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = pathlib.Path(folder, "arm.xml")
+        ...     _ = file.write_text(f"<mujoco><worldbody><body>{link}</body></worldbody></mujoco>")
+        ...     robot = dln_jax.read_robot(file)
+        >>> print(robot.tree.names, robot.tree.joints, robot.damping)
+        ('hinge',) ('revolute',) [0.1]
     """
     path, root = Path(path), parse_robot(Path(path))
     try:

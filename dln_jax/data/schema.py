@@ -96,20 +96,35 @@ def load(
     robot: Sequence[str] = (),
     repair: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
 ) -> Trajectories:
-    """Reads and checks an npz file, a CSV file or a ROS bag; never unpickles.
+    """Reads and checks trajectories from an npz file, a CSV file or a ROS bag; never unpickles.
 
     Args:
         path: .csv for CSV (see `data.csv_tables`); .db3, .mcap, .bag or a folder for a bag (see `data.bags`).
         rate: sampling rate of all trajectories, Hz, for a file without t.
         units: units of CSV titles without one, "si" or "degrees".
-        joints: names of joints to keep, in this order, or LOG=NEW to rename one (see `data.joint_names.select_names`).
+        joints: names of joints to keep, in this order, or LOG=NEW to rename one (see `data.joints.select_names`).
         topics: topics of joint states in a bag; by default the only one.
         torque_factor: factor of tau, N m per A for currents: one number, one for each joint, or numbers by name.
-        robot: names of the robot's joints; of a bag only those are read (`splits.with_joints` orders them).
+        robot: names of the robot's joints; a bag is read for these only (`splits.with_joints` orders them).
         repair: changes the arrays of the file before they are checked.
+
+    Returns:
+        Arrays of all samples in SI units; `data.schema` has their keys and shapes. Missing qd and qdd are estimated by
+        finite differences, a missing tau is zero, and `estimated` lists both.
 
     Raises:
         InputError: the file is missing, damaged or pickled, breaks the schema, or lacks a stated joint or topic.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> import dln_jax
+        >>> t = np.linspace(0.0, 2.0, 101)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     np.savez(f"{folder}/log.npz", t=t, q=np.sin(t)[:, None], tau=np.cos(t)[:, None])
+        ...     data = dln_jax.load_trajectories(f"{folder}/log.npz")
+        >>> print(data.q.shape, data.qd.shape, data.estimated)
+        (101, 1) (101, 1) ('qd', 'qdd')
     """
     suffix = Path(path).suffix.lower()
     of_bag = is_folder(Path(path)) or suffix in bags.SUFFIXES
@@ -290,11 +305,26 @@ def time_derivative(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, *
 
 
 def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> None:
-    """Writes a file that `load` reads; estimated keys are left out, so the file holds only measured data.
+    """Writes trajectories to an npz file that `load_trajectories` reads, without estimated arrays.
+
+    Args:
+        path: file name, which ends in .npz.
+        data: trajectories in SI units.
+        overwrite: replace an existing file.
 
     Raises:
         InputError: the name does not end in .npz, the file exists and `overwrite` is false, its folder does not exist,
-            or the data break the schema.
+            or the data break the schema. Nothing is written then.
+
+    Example:
+        >>> import tempfile
+        >>> import dln_jax
+        >>> from dln_jax.scenes.datasets.generators import uniform
+        >>> from dln_jax.scenes.pendulums import pendulum
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     dln_jax.save_trajectories(f"{folder}/swings.npz", uniform(pendulum(), samples=50))
+        ...     print(dln_jax.load_trajectories(f"{folder}/swings.npz").tau.shape)
+        (50, 1)
     """
     path = Path(path)
     if path.suffix != ".npz":

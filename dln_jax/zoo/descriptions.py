@@ -35,16 +35,26 @@ OWN = "own"
 
 
 def describe(model: str | Callable[..., Any], *, precision: str, **keywords: Any) -> Description:
-    """Describes a model by all keywords of its factory: those passed, and the defaults of the others.
+    """Describes a model by all keywords of its factory, with the defaults of keywords that you leave out.
 
     Args:
-        model: a name of the catalogue; a factory of your own, which must be passed again to load the model; or
+        model: a catalogue name; your own factory, which you pass again to load the model; or
             "package.module:function", which is imported and stored, so that `load(folder, trust=True)` finds it.
         precision: f32 or f64, the factory's `dtype`.
         keywords: keywords of the factory, in Python or as JSON (an activation or its name, `Needs` or a dictionary).
 
+    Returns:
+        JSON values, for `build` and `save`.
+
     Raises:
         InputError: an unknown name or keyword, a missing keyword, or a value that cannot be stored as JSON.
+
+    Example:
+        >>> import dln_jax
+        >>> needs = dln_jax.Needs(joints=("revolute", "revolute"))
+        >>> description = dln_jax.describe("structured-delan", precision="f32", needs=needs, width=16)
+        >>> print(description["name"], description["width"], description["depth"])
+        structured-delan 16 2
     """
     require_precision(precision)
     name = model if isinstance(model, str) else OWN
@@ -91,18 +101,28 @@ def typical_sizes(name: str, data: Trajectories, *, pooled: bool = False) -> dic
 
 
 def build(description: Description, *, factory: Callable[..., Any] | None = None, trust: bool = False) -> Any:
-    """Builds the model of a description: a `Model`, or a model of functions or images.
+    """Builds a model from its description.
 
-    The same description of the catalogue gives the same object again, so that its functions are traced once.
+    Equal descriptions of catalogue models return the same object, so its functions are traced once.
 
     Args:
         description: from `describe`.
         factory: your own factory, for a model outside the catalogue.
         trust: import the factory that the description names.
 
+    Returns:
+        A `Model`, or a model of functions or images: a pair of pure functions, such as `init` and `energies`.
+
     Raises:
         InputError: an unknown name; a keyword that is missing, unknown, of the wrong type or refused by the factory; or
             a factory outside the catalogue that is neither passed nor trusted.
+
+    Example:
+        >>> import dln_jax
+        >>> needs = dln_jax.Needs(joints=("revolute",))
+        >>> model = dln_jax.build(dln_jax.describe("trigonometric", precision="f32", needs=needs, degree=1))
+        >>> print(repr(model).splitlines()[0])
+        Model of 5 parameters
     """
     name = description.get("name")
     if not isinstance(name, str):
@@ -140,23 +160,40 @@ def _built(description: Description, functions: tuple[Callable[..., Any], ...]) 
 
 
 def model_names() -> dict[str, str]:
-    """The models of the catalogue by name, each with the first line on its factory."""
+    """Returns the name of every model in the catalogue, with the first line of its factory's docstring.
+
+    Example:
+        >>> import dln_jax
+        >>> names = dln_jax.model_names()
+        >>> print([name for name in names if name.endswith("delan")])
+        ['structured-delan', 'black-box-delan']
+    """
     return {name: (entry.factory.__doc__ or "").partition("\n")[0] for name, entry in CATALOGUE.items()}
 
 
 def make(name: str, needs: Needs, *, precision: str = "f64", **keywords: Any) -> Any:
-    """Makes a model of the catalogue for a plant; `print` shows its parameters.
-
-        model = make("structured-delan", Needs(joints=("revolute",)), width=16)
+    """Makes a catalogue model for a plant; `print` shows its parameters.
 
     Args:
         name: one of `model_names()`.
         needs: joints and terms of the plant.
-        precision: f32 or f64.
-        keywords: keywords of the factory.
+        precision: f32 or f64; f64 needs JAX's double precision.
+        keywords: keywords of the factory, such as `width`.
+
+    Returns:
+        A `Model`, or a model of functions or images.
 
     Raises:
         InputError: as for `describe` and `build`.
+
+    Example:
+        >>> import jax
+        >>> import dln_jax
+        >>> needs = dln_jax.Needs(joints=("prismatic", "revolute"))
+        >>> model = dln_jax.make("structured-delan", needs, precision="f32", width=8)
+        >>> arm = dln_jax.dynamics(model.energies(model.init(jax.random.key(0))))
+        >>> print(arm.mass_matrix([0.1, 0.5]).shape)
+        (2, 2)
     """
     return build(describe(name, precision=precision, needs=needs, **keywords))
 

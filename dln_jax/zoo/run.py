@@ -162,11 +162,25 @@ def save_model(
     """Writes `model.safetensors` and `model.json` into an existing folder, for `load`; public as `dln_jax.save`.
 
     Args:
+        directory: the folder.
         description: from `describe`.
-        overwrite: replace the model in the folder and discard the uncertainty of its parameters.
+        parameters: parameters of that model.
+        overwrite: replace the model in the folder and discard its uncertainty.
 
     Raises:
-        InputError: the folder does not exist or already has a model, or the parameters are of another model.
+        InputError: the folder does not exist or already has a model, or the parameters belong to another model.
+
+    Example:
+        >>> import tempfile
+        >>> import jax
+        >>> import dln_jax
+        >>> needs = dln_jax.Needs(joints=("revolute",))
+        >>> description = dln_jax.describe("structured-delan", precision="f32", needs=needs, width=8)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     dln_jax.save(folder, description, dln_jax.build(description).init(jax.random.key(0)))
+        ...     run = dln_jax.load(folder)
+        >>> print(run.description["width"], run.dynamics.inverse_dynamics([0.3], [0.5], [2.0]).shape)
+        8 (1,)
     """
     directory = Path(directory)
     if not directory.is_dir():
@@ -189,16 +203,31 @@ def save(directory: str | Path, description: Description, parameters: Parameters
 
 
 def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, trust: bool = False) -> Run:
-    """Loads the trained run in a folder.
+    """Loads a trained model from its run folder.
 
     Args:
-        directory: folder written by a training command or by `save`.
+        directory: folder written by a training command, by `Fit.save` or by `save`.
         factory: factory of a model outside the catalogue.
-        trust: import the factory that the file names. Use it only for files that you have written: importing runs code.
+        trust: import the factory that the file names. Use it only for your own files: importing runs code.
+
+    Returns:
+        The model with jitted functions of one state (`dynamics`, `flow`, ...), its parameters and its uncertainty.
 
     Raises:
-        InputError: the folder has no model, or a damaged or altered one or one of another schema; a factory outside the
-            catalogue is neither passed nor trusted; or the model needs double precision (the message names the line).
+        InputError: the folder has no model, or the model is damaged, altered or from another schema; a factory outside
+            the catalogue is neither passed nor trusted; or the model needs double precision (the message has the line
+            to add).
+
+    Example:
+        >>> import tempfile
+        >>> import jax
+        >>> import dln_jax
+        >>> needs = dln_jax.Needs(joints=("revolute",))
+        >>> description = dln_jax.describe("trigonometric", precision="f32", needs=needs, degree=1)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     dln_jax.save(folder, description, dln_jax.build(description).init(jax.random.key(0)))
+        ...     print(repr(dln_jax.load(folder)).splitlines()[0])
+        Run of trigonometric: 5 parameters, f32
     """
     directory = Path(directory)
     description = read_description(directory)

@@ -63,23 +63,42 @@ def fit(
     must_start: bool = True,
     mesh: Mesh | None = None,
 ) -> Training:
-    """Minimises a problem's loss and keeps the parameters with the lowest score.
+    """Minimises the loss of a problem and keeps the parameters with the lowest score.
 
     Args:
         problem: residual or loss, initial parameters, samples and score.
-        optimiser: `Adam` or `GaussNewton`; the latter needs parameters and data in float64.
+        optimiser: `Adam`, or `GaussNewton` for parameters and data in float64.
         checkpoint: where to store the run after every dispatch, and whether to resume a stored run.
         report: called after every dispatch.
-        seconds: time limit of this call, compilation included, also for a resumed run. It is checked between
-            dispatches; at least one dispatch runs. The schedule of the learning rate does not depend on it.
-        must_start: whether an initial loss that is not finite raises an error; otherwise it is a result.
-        mesh: devices that share the training. Several seeds are split over them, and every device trains its own. With
-            one seed the samples are split: those of a step's batch for Adam, all of them for Gauss-Newton; every device
-            computes the whole score. Checkpoints do not depend on the devices; results do only by rounding.
+        seconds: time limit of this call with compilation, also for a resumed run. It is checked between dispatches, and
+            at least one dispatch runs. The learning rate schedule does not depend on it.
+        must_start: raise an error if the initial loss is not finite; otherwise report it in the result.
+        mesh: devices that share the training. They split several seeds. With one seed they split the samples (of a
+            batch for Adam, all for Gauss-Newton), and each computes the whole score. Checkpoints do not depend on the
+            devices, and results only within rounding.
+
+    Returns:
+        The best parameters, the history of losses and scores, and the reason for the end (`stop`).
 
     Raises:
         InputError: settings are out of range, the initial loss is not finite, the checkpoint belongs to another run, or
             the number of devices does not divide the samples of a batch.
+
+    Example:
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> import dln_jax
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> x = jnp.linspace(0.0, 3.0, 50)
+        >>> wave = dln_jax.Problem(
+        ...     residual=lambda w, x, y: w[0] * jnp.sin(w[1] * x) - y,
+        ...     parameters=jnp.ones(2),
+        ...     arrays=(x, 0.5 * jnp.sin(1.2 * x)),
+        ...     score=lambda w: (jnp.mean((w[0] * jnp.sin(w[1] * x) - 0.5 * jnp.sin(1.2 * x)) ** 2), jnp.nan),
+        ... )
+        >>> result = dln_jax.fit(wave, dln_jax.GaussNewton(steps=20))
+        >>> print(result.parameters.round(6), result.stop.reason)
+        [0.5 1.2] finished
     """
     began = time.perf_counter()
     require_positive(seconds=seconds)

@@ -19,24 +19,40 @@ NO_START = "the loss is not finite before training; look for very large numbers 
 
 
 class Problem(NamedTuple):
-    """Loss, initial parameters, samples and score of a training."""
+    """A training problem for `fit`: residual or loss, initial parameters, samples and score.
+
+    The loss is (1/N) Σₙ |r(w, sampleₙ)|². `fit` keeps the parameters with the lowest score, which usually is the error
+    on validation samples. Functions and arrays are JAX's; units are your own.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import dln_jax
+        >>> x, held_out = jnp.linspace(-1.0, 1.0, 40), jnp.array([-0.5, 0.5])
+        >>> square = dln_jax.Problem(
+        ...     residual=lambda w, x, y: w["a"] * x**2 - y,
+        ...     parameters={"a": jnp.zeros(())},
+        ...     arrays=(x, 2 * x**2),
+        ...     score=lambda w: (jnp.mean((w["a"] * held_out**2 - 2 * held_out**2) ** 2), jnp.nan),
+        ... )
+        >>> print(dln_jax.fit(square, dln_jax.Adam(steps=300, batch=8, learning_rate=0.1)).parameters["a"].round(2))
+        2.0
+    """
 
     residual: Callable[..., Array] | None
-    """(parameters, *sample) -> the residuals of one sample, of any shape; the loss is the mean over samples of the sum
-    of their squares. `None` if the loss has no such form."""
+    """(parameters, *sample) -> residuals r of one sample, of any shape; `None` if you give `loss` instead."""
     parameters: Any
-    """Initial parameters."""
+    """Initial parameters w, any tree of arrays."""
     arrays: tuple[Any, ...]
-    """Samples on axis 0; `None` is passed on unchanged."""
+    """Samples on axis 0 of each array; a `None` is passed on."""
     score: Callable[[Any], tuple[Array, Array]]
-    """Parameters of one seed -> the score to minimise, and a score for display only (NaN for none)."""
+    """Parameters of one seed -> the score to minimise, and a second score for display (NaN for none)."""
     seed: int | Array = 0
-    """Seed of the order of the samples. An array [K] trains K seeds in one program, with the results of K runs; the
+    """Seed of the sample order. An array [K] trains K seeds in one program, with the results of K separate runs; the
     parameters then have a leading axis of K."""
     loss: Callable[[Any, Any], Array] | None = None
-    """(parameters, batch) -> the loss that Adam minimises, if it is not the mean of squared residuals."""
+    """(parameters, batch) -> loss for Adam, if it is not the mean of squared residuals."""
     loss_is_mean: bool = True
-    """Whether `loss` is the mean of the losses of equal parts of a batch, so that devices may share its samples."""
+    """Whether `loss` averages over the samples, so that devices may split a batch."""
 
     @property
     def several(self) -> bool:
