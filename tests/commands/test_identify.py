@@ -87,7 +87,7 @@ def test_mistakes_are_one_line(workplace, capsys):
     np.savez("silent.npz", t=log["t"], q=log["q"])
     (workplace / "broken.urdf").write_text("<robot>")
     rows = {
-        "--data other.npz": "joint 'shoulder' is not among the data's (elbow, wrist)",
+        "--data other.npz": "joint 'shoulder' is not in the data (elbow, wrist)",
         "--data one.npz": "the data have 1 joints, the robot 2",
         "--data silent.npz": "there is no tau",
         "--robot broken.urdf": "not XML",

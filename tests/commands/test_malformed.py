@@ -142,7 +142,7 @@ def test_only_what_is_needed_is_read_and_no_more_than_the_bound(here, monkeypatc
     with one_line(r"'x' is missing.*not read: t, .*notes"):
         functions.load("data.npz")
     monkeypatch.setattr(arrays, "MOST_BYTES", 1000)
-    with one_line("holds more than"):
+    with one_line("larger than"):
         schema.load("data.npz")
 
 

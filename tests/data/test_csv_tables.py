@@ -72,7 +72,7 @@ def test_units_that_no_title_states_are_asked_for(load):
 
 def test_radians_are_not_read_as_degrees(load):
     rows = "0,1.5,-3\n1,6.2,1\n2,0.5,0\n"
-    with one_line(r"q goes to 6\.2 at most, as angles in radians do; give --units si, or"):
+    with one_line(r"q reaches only 6\.2, which looks like radians; give --units si, or"):
         load("t,q1,q2\n" + rows, units="degrees")
     # A unit in the title is the way out, and one joint that is beyond a turn decides for all.
     assert_allclose(load("t,q1 [deg],q2 [deg]\n" + rows, units="degrees").q[0, 0], np.deg2rad(1.5))

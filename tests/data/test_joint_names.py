@@ -39,7 +39,7 @@ def test_statements_about_joints_are_checked():
         (lambda: select_names(three, ["a="]), "lacks a name"),
         (lambda: select_names(three, ["a", "a"]), "names a joint twice"),
         (lambda: scale_torques(arrays, 0.0), "zero"),
-        (lambda: match_names(["elbow", "hip"], ["knee", "hip"]), r"'knee' is not among the data's \(elbow, hip\)"),
+        (lambda: match_names(["elbow", "hip"], ["knee", "hip"]), r"'knee' is not in the data \(elbow, hip\)"),
         (
             lambda: match_names(arms, ["elbow", "wrist"]),
             r"more than one way \(left_elbow=elbow, .*; right_elbow=elbow",
@@ -67,8 +67,8 @@ def test_files_with_names_are_matched_and_say_so(tmp_path):
     q = np.stack([t, 2 * t, 3 * t], axis=1)
     np.savez(path, t=t, q=q)
     for stated, words in (
-        ({"joints": ["a"]}, "--joints needs the joints' names"),
-        ({"torque_factor": 2.0}, "scales tau, which the file lacks"),
+        ({"joints": ["a"]}, "--joints needs joint names"),
+        ({"torque_factor": 2.0}, "scales tau, but the file has no tau"),
         ({"topics": ["/a"]}, "--topics is for ROS bags"),
     ):
         with one_line(words):

@@ -134,7 +134,7 @@ def test_joints_are_locked_at_their_positions(tmp_path):
 def test_a_gripper_whose_fingers_are_tied_and_a_free_base_can_be_locked(tmp_path):
     tied = ARM.replace('<parent link="two"/>', '<mimic joint="elbow"/><parent link="two"/>')
     path = written(tmp_path, "arm.urdf", tied)
-    with one_line(r"joint 'slide' follows another \(mimic\)"):
+    with one_line(r"joint 'slide' follows another joint \(mimic\)"):
         read_robot(path)
     assert read_robot(path, lock=["sl*"]).tree.names == ("shoulder", "elbow")
     with one_line(r"there is no joint 'finger\*' to lock; the joints are shoulder, elbow"):

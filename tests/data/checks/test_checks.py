@@ -359,7 +359,7 @@ def test_torques_without_gravity_are_named_and_fitted_so():
     robot = planar(UPRIGHT)
     data = from_arrays(log(torques(planar((0.0, 0.0, 0.0)), (0.1, 0.1))))
     known = log_of(data, "log.npz", robot=robot, check=True)
-    assert any("tau holds no gravity" in line for line in known.remarks)
+    assert any("tau does not include gravity" in line for line in known.remarks)
     assert not any("clock" in line for line in known.remarks) and not any("gravity" in fault for fault in known.faults)
     tree = known.robot.tree
     assert not np.any(tree.gravity) and np.array_equal(tree.inertias, robot.tree.inertias)
