@@ -80,7 +80,11 @@ def test_a_log_is_filtered_by_default_only_where_noise_matters_and_rates_are_mis
 def test_errors_in_a_log_stop_a_training_unless_they_are_accepted(log, capsys):
     given = "--data degrees.npz --model trigonometric --degree 1 --out run"
     said = refused(capsys, train_delan, given)
-    assert "convert to radians" in said and "--accept-log" in said and "details: dln-jax check_data --data degrees.npz" in said
+    assert (
+        "convert to radians" in said
+        and "--accept-log" in said
+        and "details: dln-jax check_data --data degrees.npz" in said
+    )
     assert not Path("run").exists()
     command(train_delan, given, "--accept-log --no-figures --no-uncertainty")
     said = capsys.readouterr().out

@@ -263,7 +263,7 @@ def test_torque_scale_never_divides_by_zero():
     data = generators.uniform(cart_pole(), samples=100)
     scale = torque_scale(data)
     assert scale[0] == pytest.approx(data.tau[:, 0].std()) and scale[1] == pytest.approx(scale[0])
-    with one_line("tau is constant in every training sample"):
+    with one_line("tau is constant in all training samples"):
         torque_scale(data._replace(tau=np.full_like(data.tau, 7.3)))
 
 

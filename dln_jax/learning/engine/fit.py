@@ -1,6 +1,6 @@
-"""The one loop of all trainings: dispatches of compiled steps, with checkpoints for resuming bit for bit.
+"""The loop of all trainings: dispatches of compiled steps, with checkpoints that resume bit for bit.
 
-Gauss-Newton (Levenberg-Marquardt) is one stage, or two: on a subset of the samples if there are many, then on all.
+Gauss-Newton (Levenberg-Marquardt) has one stage, or two if there are many samples: first a subset, then all.
 """
 
 import functools
@@ -133,7 +133,7 @@ def fit(
                 run, dispatched = run._replace(state=state), True
                 ended = stage.ended(state)
                 if ended and ended.reason == "not finite" and np.array_equal(before, state.step):
-                    continue  # nothing to report, and the stored state is as good
+                    continue  # the stored state is already the last good one
                 at = Progress(plain(state.step), loss, validation, monitor, train_seconds, stage.name)
                 history.append(at)
                 if checkpoint is not None:
@@ -152,19 +152,19 @@ class NewtonState(NamedTuple):
 
     solver: LevenbergMarquardtState
     earlier: Array
-    """[] iterations of the stage before this one."""
+    """[] iterations of the previous stage."""
     best: Best
 
     @property
     def step(self) -> int:
-        """Iterations done; with several seeds, their maximum."""
+        """Number of iterations; the maximum over several seeds."""
         return int(self.earlier) + int(np.max(np.asarray(self.solver.iteration)))
 
 
 def newton_stages(problem: Problem, optimiser: GaussNewton, shared: Sharing) -> list[Stage]:
     """Returns one stage, or two if the run starts on a subset of the samples."""
     if problem.residual is None:
-        raise InputError("Gauss-Newton needs the residuals of a sample, which this problem lacks; take Adam")
+        raise InputError("Gauss-Newton needs residuals, but this problem has only a loss; use Adam")
     leaves = jax.tree.leaves(problem.parameters)
     seeds = leaves[0].shape[0] if problem.several else 1
     count = sum(leaf.size for leaf in leaves) // seeds
@@ -200,13 +200,13 @@ def _newton_stage(
         return Stop("finished", state.step) if done else None
 
     def remaining(state: NewtonState) -> int:
-        """Largest number of iterations left to the seeds that still run."""
+        """Largest number of remaining iterations over the seeds that still run."""
         solver = state.solver
         done = np.ravel(solver.iteration)[np.ravel(solver.status) == Status.RUNNING]
         return max(iterations - int(done.min()), 0) if done.size else 0
 
     def compile_(state: NewtonState) -> Dispatch:
-        """Compiles two programs: the iterations (quickly), and their score with the best state so far."""
+        """Compiles two programs: the iterations (with quick compilation), and the score that keeps the best state."""
         chunks = jax.jit(lambda arrays: levenberg_marquardt.in_chunks(arrays, shared.samples))(arrays)
         chunks = replicate(chunks, shared.seeds) if shared.samples is None else shard(chunks, shared.samples)
         advance = spread(lambda whole, solver: iterate(solver, *whole, samples=len(arrays[0])), shared.seeds)
