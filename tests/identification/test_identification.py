@@ -109,7 +109,7 @@ def test_a_joint_that_never_moves_is_said():
     """The other's parameters are result; what only its motion shows stays as the file has it."""
     data = motions(3, noise=0.01, still=(1,))
     result = identify(MODEL, ROUGH, data)
-    assert findings(result, data, ARM.names)[0].startswith("elbow: does not move; ")
+    assert findings(result, data, ARM.names)[0].startswith("elbow: does not move, ")
     assert {"armature_2", "viscous_2"} <= {*lost(result)}
     moved, unseen = (COLUMNS.names.index(f"viscous_{joint}") for joint in (1, 2))
     assert result.seen[moved] == "alone" and abs(result.fit.theta[moved] - FRICTION["viscous"][0]) < 0.05
