@@ -82,7 +82,7 @@ def test_topics_of_different_rates_are_put_on_the_slower_clock(bag):
     assert_allclose([data.q, data.qd], [q, qd], atol=1e-7)
     assert_allclose(data.tau, tau * [0.5, 1], atol=1e-12)
     assert "effort of elbow in /currents, 100 Hz; q and qd by cubic splines" in data.remarks[0]
-    assert data.remarks[1] == "tau is that of the log times elbow 0.5, shoulder 1"
+    assert data.remarks[1] == "tau of the log is multiplied by elbow 0.5, shoulder 1"
 
 
 def test_gaps_of_one_topic_are_left_out(bag):

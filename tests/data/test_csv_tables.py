@@ -114,9 +114,9 @@ MALFORMED = (
     ("t [s],,q1 [rad]\n0,1,2\n", "column 2 has no title"),
     ("t [s],q1 [rad],q2 [rad],tau1 [N m]\n0,1,2,3\n", "no column 'tau2'"),
     ("t [s],q1 [rad],tau1 [N m],tau2 [N m]\n0,1,2,3\n", "no column 'q2'"),
-    ("t [s],q1 [rad],tau1 [MN m]\n0,1,2\n", r"the unit of 'tau1 \[MN m\]' is not known"),  # not milli
+    ("t [s],q1 [rad],tau1 [MN m]\n0,1,2\n", r"'tau1 \[MN m\]' has an unknown unit"),  # not milli
     ("t_s,q1_rad,tau1_MNm\n0,1,2\n", "there is no column 'q1_MNm'|tau1_MNm"),
-    ("t [s],q1 [rad],qd1 [rad]\n0,1,2\n", r"the unit of 'qd1 \[rad\]' is not known"),
+    ("t [s],q1 [rad],qd1 [rad]\n0,1,2\n", r"'qd1 \[rad\]' has an unknown unit"),
     (b"\xff\xfe\x00t\x00,", "not a text file in UTF-8"),
     (HEADER.encode() + b"\x00\x00,1,2,3,4\n", "line"),
     (HEADER + f'"{"x" * 200_000}",1,2,3,4\n', "line 2 is not CSV"),

@@ -35,7 +35,7 @@ def test_statements_about_joints_are_checked():
     assert scale_torques(arrays, {"b": -2})["tau"].tolist() == [[1.0, -2.0]]
     three, arms = ["a", "b", "c"], ["left_elbow", "left_wrist", "right_elbow", "right_wrist"]
     for call, words in (
-        (lambda: select_names(three, ["d"]), "'d' is not among"),
+        (lambda: select_names(three, ["d"]), "'d' is not a joint"),
         (lambda: select_names(three, ["a="]), "lacks a name"),
         (lambda: select_names(three, ["a", "a"]), "names a joint twice"),
         (lambda: scale_torques(arrays, 0.0), "zero"),

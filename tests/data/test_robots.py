@@ -262,5 +262,5 @@ def test_a_pipe_in_a_model_is_refused_and_not_waited_for(name, tmp_path):
     part = '<include file="parts/pipe.obj"/>' if name == "include" else asset
     (tmp_path / "part.xml").write_text(f"<mujoco>{part}</mujoco>")
     (tmp_path / "arm.xml").write_text('<mujoco><include file="part.xml"/></mujoco>')
-    with one_line("is no regular file"):
+    with one_line("is not a regular file"):
         read_robot(tmp_path / "arm.xml")
