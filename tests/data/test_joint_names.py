@@ -45,7 +45,7 @@ def test_statements_about_joints_are_checked():
             r"more than one way \(left_elbow=elbow, .*; right_elbow=elbow",
         ),
         (lambda: with_joints(NAMED, ("elbow", "slide", "wrist")), "have 2 joints, the robot 3"),
-        (lambda: with_joints(NAMED, ("elbow", "wrist")), "'wrist' is not among"),
+        (lambda: with_joints(NAMED, ("elbow", "wrist")), "'wrist' is not in the data"),
         (lambda: in_blocks(NAMED, 7), "has 6 samples, too few for 7"),
     ):
         with one_line(words):
