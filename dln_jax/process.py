@@ -43,7 +43,7 @@ def is_command() -> bool:
 def held_back() -> Iterator[None]:
     """Delays SIGINT and SIGTERM to the end of the block, such as a training step and its checkpoint.
 
-    Python raises an interrupt only when a compiled program returns, so the additional delay is that of the checkpoint.
+    Python raises an interrupt only when a compiled program returns, so the block adds only the time of its checkpoint.
     Has no effect outside the main thread, because only the main thread may set signal handlers.
     """
     if threading.current_thread() is not threading.main_thread():

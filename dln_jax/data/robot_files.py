@@ -219,7 +219,7 @@ def _motors(tree: Tree) -> tuple[np.ndarray, list[Motor]]:
 
 
 def _split(motors: Any, losses: dict[str, Any]) -> tuple[dict[str, Any], list[Motor]]:
-    """Separates the friction of joints with their own motor from that of coupled motors."""
+    """Separates the friction of joints with their own motor from the friction of coupled motors."""
     if motors is None:
         return losses, []
     S = np.asarray(motors, float)

@@ -84,7 +84,7 @@ def describe_rigid_tree(
         velocity_scale: velocity scale of dry friction, rad/s or m/s (default: fitted).
         cooling: whether viscous friction may fall with temperature.
         motors: rows of S in the motor rates S qd.
-        coupled: pairs of joints whose motors may share an inertia.
+        coupled: pairs of joints with motors that may share an inertia.
 
     Raises:
         InputError: as for `fit_friction`.

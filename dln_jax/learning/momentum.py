@@ -46,7 +46,7 @@ FEWEST = 8
 OVERLAP = 5
 """Number of windows that start within one window length; more would be nearly redundant."""
 CHUNK = 4096
-"""Samples whose columns are in memory at a time."""
+"""Number of samples per chunk of columns in memory."""
 ROUNDS = 10
 """Largest number of reweighted fits; three to five are usual."""
 SETTLED = 0.01
@@ -79,8 +79,10 @@ def fit_momentum(
     solution with its rank and condition number.
 
     Args:
-        model: linear in its parameters, such as `models.make_rigid_tree` and `models.make_trigonometric`.
-        data: samples at equal time steps, with smooth velocities and measured torques, from `data.encoders.smooth`.
+        model: linear in its parameters, such as `models.trees.make_rigid_tree` and
+            `models.trigonometric.make_trigonometric`.
+        data: samples at equal time steps, with smooth velocities and measured torques, from
+            `data.encoders.smoothing.smooth`.
         window: length in s, at least `FEWEST` steps.
         noise: standard deviation of the torque noise of each joint, which divides the equations (default: of the
             torques).
@@ -161,7 +163,9 @@ def _cut(data: Trajectories, window: float) -> tuple[list[Int[np.ndarray, "W S+1
     for piece in pieces:
         late = np.abs(data.t[piece] - data.t[piece[0]] - dt * np.arange(len(piece)))
         if len(piece) > FEWEST and late.max() > 10 * EVEN * dt * len(piece):
-            raise InputError("windows need equal time steps, but the steps vary; resample with data.encoders.smooth")
+            raise InputError(
+                "windows need equal time steps, but the steps vary; resample with data.encoders.smoothing.smooth"
+            )
     windows = [np.lib.stride_tricks.sliding_window_view(piece, steps + 1) for piece in pieces if len(piece) > steps]
     if not windows:
         raise InputError(f"no segment of the data is as long as a window of {window:g} s; give a shorter one")

@@ -135,7 +135,7 @@ def make_linear_refit(model: Model) -> Refit:
     `solvers.least_squares`).
 
     Args:
-        model: linear in its parameters, such as `models.planar_chain` or `models.rigid_tree`.
+        model: linear in its parameters, such as `make_planar_chain` or `make_rigid_tree`.
     """
     columns_of = design(model)
 

@@ -166,7 +166,7 @@ def prediction_metrics(
     """Returns mean and median valid prediction times over the segments, with their upper bounds.
 
     The entries are `vpt_seconds`, `vpt_median_seconds`, `predicted_seconds` (the duration), `energy_drift` and, if
-    motions diverge, `vpt_lyapunov` (in Lyapunov times) and `lyapunov_seconds`. The Lyapunov time is that of the model.
+    motions diverge, `vpt_lyapunov` (in Lyapunov times) and `lyapunov_seconds`. The model defines the Lyapunov time.
     """
     times = valid_times(segments, predicted, fitted=fitted, variance=variance)
     growth = float(np.mean(predicted.growth))

@@ -116,7 +116,8 @@ def held_out(
     Args:
         predicted: torques of the model.
         measured: torques of motions that the model has not seen.
-        noise: standard deviation of each torque's noise, for example from `data.encoders.noise_of`; NaN if unknown.
+        noise: standard deviation of each torque's noise, for example from `data.encoders.sampling.noise_of`; NaN if
+            unknown.
         file: torques that the robot's file predicts.
         recording: torques of the whole recording, if the held-out samples are blocks of it; the variance of single
             blocks may be small by chance.

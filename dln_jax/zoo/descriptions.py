@@ -31,7 +31,7 @@ from dln_jax.zoo.parameter_files import REMEDY
 Description = dict[str, Any]
 """Name, precision and keywords of a model, as JSON values."""
 OWN = "own"
-"""Name of a model whose factory is not stored in the file."""
+"""Name of a model without a stored factory."""
 
 
 def describe(model: str | Callable[..., Any], *, precision: str, **keywords: Any) -> Description:

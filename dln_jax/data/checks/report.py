@@ -35,7 +35,7 @@ BLINDING = ("saturation-tau", "saturation-q", "dead-torque", "constant-torque", 
 """Findings that rule out an examination of the torques without a robot."""
 WIDTH = 10
 """Characters per column of the report's table."""
-ESTIMATED = "--cutoff auto, or data.encoders.smooth(), filters q before rates are derived"
+ESTIMATED = "--cutoff auto, or data.encoders.smoothing.smooth(), filters q before rates are derived"
 
 
 class Examination(NamedTuple):

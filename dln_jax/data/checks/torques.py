@@ -270,7 +270,7 @@ def check_torques(torques: Torques, *, friction_stated: bool, with_robot: bool) 
          f"the torque of {{}} has the wrong sign ({torques.gain})", "change the sign of that tau or that q"),
         ("error", "order", np.array(log.order) != np.arange(len(log.order)),
          f"the torques of {{}} are exchanged: columns {columns} of tau fit q ({torques.gain})",
-         "order the columns of tau as those of q"),
+         "order the columns of tau like the columns of q"),
         ("warning", "delay", log.delay != 0, f"torques are {late} relative to positions ({torques.gain})",
          "shift one of them in time, or correct the clock of the log"),
     )  # fmt: skip

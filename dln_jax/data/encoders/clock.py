@@ -62,7 +62,7 @@ def source_clock(data: Trajectories, interpolated: Bool[np.ndarray, " N"] | None
 
     Args:
         data: rows without repeats, with measured qd.
-        interpolated: rows whose q was not measured.
+        interpolated: rows with interpolated instead of measured q.
     """
     known = np.arange(len(data.t)) if interpolated is None else np.flatnonzero(~interpolated)
     if "qd" in data.estimated or len(known) <= LEAST:

@@ -76,7 +76,7 @@ class Repeats(NamedTuple):
 
     @property
     def rows(self) -> Bool[np.ndarray, " N"]:
-        """Samples whose coordinates and torques both repeat."""
+        """Samples with repeated coordinates and torques."""
         return self.q & self.tau
 
 

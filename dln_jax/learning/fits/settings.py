@@ -116,7 +116,7 @@ class Kernel(Way):
 
 @dataclass(frozen=True)
 class Arm(Way):
-    """Prior knowledge of an arm whose joint frames are searched."""
+    """Prior knowledge of an arm for the search of its joint frames."""
 
     parents: Unstated[str] = None
     """Parent joint of every joint, counted from 1, with 0 for the ground, such as 0,1,2,1 (default: a chain)."""

@@ -36,7 +36,7 @@ FINALISTS, NEAR = 3, 2.0
 ROUNDS = 2
 """Rounds of reweighting the joints by unexplained torque; more rounds change the weights by a few per cent."""
 CHUNK = 4096
-"""Samples whose columns are in memory at a time."""
+"""Number of samples per chunk of columns in memory."""
 LEAST_NOISE = 1e-7
 """Lower bound on the noise in a joint's weight, relative to its torque."""
 
