@@ -1,8 +1,9 @@
 """Physically consistent parameters: least squares over positive definite pseudo-inertias and positive coefficients.
 
 A body has the pseudo-inertia J = L M Lᵀ, where J_0 = L Lᵀ is its prior and M is symmetric and positive definite. M is
-relative to the prior, so its entries have no units. The armature matrix of coupled motors has the same form. All other
-armature and friction coefficients are c = c_0 exp(z). M and z minimise
+relative to the prior, so its entries have no units. The armature matrix of coupled motors has the same form; its
+entries between uncoupled motors are zero. All other armature and friction coefficients are c = c_0 exp(z). M and z
+minimise
 
     F = sum over joints of |Phi_j theta - tau_j|² / noise_j²  +  regularisation (sum of D(J | J_0) + sum of z² / 2)
 
@@ -78,8 +79,8 @@ def fit_consistent(
     Args:
         triangle: triangular factor of the equations in units of noise, from `equations.whiten`.
         columns: columns of the P parameters; the ten of a body are adjacent.
-        known: prior and initial values. `nearest_body` replaces an inconsistent body, and a small positive value
-            replaces a zero coefficient. A body with ten zeros is absent and stays zero.
+        known: prior and initial values. `nearest_body` replaces an inconsistent body. A value that explains a hundredth
+            of the torque replaces a zero coefficient. A body with ten zeros is absent and stays zero.
         regularisation: cost of a unit of divergence, in squares of the noise; positive, because data never determine
             all parameters.
 

@@ -146,7 +146,7 @@ def valid_times(
     fitted: int,
     variance: Float[np.ndarray, " d"],
 ) -> Float[np.ndarray, " W"]:
-    """Returns the valid prediction time of each segment in s, counted from the last fitted sample."""
+    """Returns the valid prediction time of each segment in s from the last fitted sample, by measured samples."""
     measured = (segments.weight > 0) & (np.arange(segments.t.shape[1]) >= fitted - 1)
     return np.array(
         [

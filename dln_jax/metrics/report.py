@@ -53,7 +53,7 @@ def conditions(**facts: Any) -> dict[str, Any]:
 
 
 def write_report(path: Path, rows: Sequence[Row], facts: Mapping[str, Any]) -> None:
-    """Writes the conditions and rows as JSON; infinities and NaN become null."""
+    """Writes the conditions, with the expectations of rows, and the rows as JSON; infinities and NaN become null."""
     listed = [{**dict(zip(Row._fields[:6], row, strict=False)), "pass": row.passed} for row in rows]
     words = {f"{row.case} {row.quantity}": row.expected for row in rows if row.expected}
     write_json(path, {"conditions": {**facts, **({"expected": words} if words else {})}, "rows": listed})

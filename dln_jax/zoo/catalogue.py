@@ -97,8 +97,8 @@ def make_stored_tree(needs: Needs, *, tree: dict[str, Any], **keywords: Any) -> 
     frames = tree_from_json(tree)
     if (frames.joints, frames.needs.gravity) != (needs.joints, needs.gravity):
         raise InputError(
-            f"the needs do not match the rigid tree, which has joints {frames.joints} and "
-            f"gravity={frames.needs.gravity}: {needs}"
+            f"the rigid tree has joints {frames.joints} and gravity={frames.needs.gravity}, but the needs are {needs}; "
+            "pass needs that match"
         )
     return make_rigid_tree(frames, friction=needs.joint_friction or needs.friction, **keywords)
 

@@ -182,7 +182,7 @@ def report(examined: Examination, name: str) -> list[str]:
         determined = f"the motions determine {on_tree.rank} of {on_tree.parameters} parameters, friction included"
         lines += [f"robot: {determined} (some are never determined alone); condition {on_tree.condition:.3g}", ""]
     if torques is not None:
-        by = "the robot's file with friction" if on_tree is not None else "a generic arm model with friction"
+        by = "a model near the robot's file" if on_tree is not None else "a generic arm model with friction"
         lines.append(
             f"torques: {by} explains {torques.explained.mean():.1%} of the variance in left-out blocks; the most "
             f"likely delay is {torques.likely_delay:.2f} samples"

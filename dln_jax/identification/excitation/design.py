@@ -282,7 +282,7 @@ def together(designs: Sequence[Design]) -> tuple[float, float]:
 
 
 def error_ratio(designs: Sequence[Design], others: Sequence[Design]) -> float:
-    """Returns the geometric mean over parameters of the ratio of standard errors from equally many designs."""
+    """Returns the geometric mean over parameters of the standard errors from `designs` relative to as many `others`."""
     count = designs[0].information.shape[0]
     return float(np.exp((together(others)[1] - together(designs)[1]) / (2 * count)))
 

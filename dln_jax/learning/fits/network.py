@@ -160,7 +160,7 @@ def train_plan(plan: Fit, sets: Split, context: Context, *, name: str = CHECKPOI
 def cross_validate(plan: Fit, sets: Split, context: Context, folds: int) -> int:
     """Returns the index of the seed with the lowest cross-validation error over folds of the motions.
 
-    A single validation motion often prefers the worse of two seeds. Every motion outside the test is in one fold.
+    One or two validation motions often prefer the worse of two seeds. Every motion outside the test is in one fold.
     """
     rest = merged(sets._replace(test=trajectories(sets.test, [])))
     motions = np.random.default_rng(np.ravel(plan.seeds)[0]).permutation(np.unique(rest.trajectory))
