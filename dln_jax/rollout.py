@@ -1,4 +1,4 @@
-"""Rollouts: many steps as one scan, differentiable from end to end."""
+"""Many steps as one scan, differentiable from end to end."""
 
 from collections.abc import Callable
 from typing import Any

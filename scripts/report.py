@@ -1,14 +1,14 @@
 """Measure the project: `python -m scripts.report NAME [OPTIONS]`, or `--all`; `--docs [FOLDER]` fills docs/results.md.
 
 --docs takes the numbers of all reports below FOLDER (default: runs), of the later ones where two have the same number,
-and none of --quick. In the page a comment before a table names the report, the cells of a row, and what * stands for in
-each row; or what it stands for in each column, and the cell of each row:
+and none of --quick. A comment in the page names the table below it, as REPORT/TABLE. For each table,
+reports/tables.json has the cells of a row, and what * stands for in each row; or what it stands for in each column, and
+the cell of each row:
 
-    <!-- report: arm
-    | {*/letters torque_mse} / {published */letters torque_mse} | {*/swings vpt_seconds:.1f} |
-    structured-delan
-    black-box-delan
-    -->
+    "arm/letters": [
+      ["{*/letters torque_mse} / {published */letters torque_mse}", "{*/swings vpt_seconds:.1f}"],
+      ["structured-delan", "black-box-delan"]
+    ]
 
 Header and first column are the page's own, and so is a cell whose first number was not measured. What follows a slash
 is left out if it has no number.
@@ -28,7 +28,8 @@ from scripts.reports.run import REMEDY, report
 
 NAMES = sorted(file.stem for file in Path(__file__).parent.glob("reports/cases/*.py"))
 PAGE = Path(__file__).parents[1] / "docs" / "results.md"
-TABLE = re.compile(r"<!-- report: (\S+)\n((?:.+\n)+?) *-->\n\n?((?: *\|.*\n)+)")
+TEMPLATES = read_json(Path(__file__).parent / "reports" / "tables.json", remedy=REMEDY)
+TABLE = re.compile(r"<!-- ((\w+)/\S+) -->\n\n?((?: *\|.*\n)+)")
 NUMBER = re.compile(r"\{(published )?(.+?)(?::(.+?))?\}")
 Numbers = dict[str, dict]
 """Rows of a report as stored, by "ROW QUANTITY"."""
@@ -72,15 +73,15 @@ def measured_below(folder: Path) -> dict[str, Numbers]:
 
 
 def fill_page(page: str, measured: dict[str, Numbers]) -> str:
-    """The page with measured numbers in its tables; a table must have the rows and columns of its comment."""
+    """The page with measured numbers in its tables; a table must have the rows and columns of its template."""
 
     def fill_table(table):
-        name, comment, lines = table.groups()
-        across, *down = map(cells, comment.splitlines())
+        key, name, lines = table.groups()
+        across, down = TEMPLATES[key]
         header, rule, *rows = lines.splitlines()
         filled = [header, rule]
-        for (key,), row in zip(down, rows, strict=True):
-            label, *texts = cells(row)
+        for key, row in zip(down, rows, strict=True):
+            label, *texts = (cell.strip() for cell in row.strip().strip("|").split("|"))
             for place, word in enumerate(across):
                 keys = (key, word) if "{" in key else (word, key)
                 texts[place] = fill_cell(texts[place], *keys, measured[name])
@@ -88,11 +89,6 @@ def fill_page(page: str, measured: dict[str, Numbers]) -> str:
         return table[0].removesuffix(lines) + "\n".join(filled) + "\n"
 
     return TABLE.sub(fill_table, page)
-
-
-def cells(line: str) -> list[str]:
-    """The texts of a row of a table in Markdown."""
-    return [cell.strip() for cell in line.strip().strip("|").split("|")]
 
 
 def fill_cell(text: str, template: str, row: str, numbers: Numbers) -> str:

@@ -15,7 +15,9 @@ import pytest
 from calls import command
 from conftest import PROGRAMS, SHORTEST_COMPILATION, slow_among
 from interpreters import Program, interpreters
+from planar_arm import URDF, motions
 
+from dln_jax import read_robot
 from dln_jax.commands import COMMANDS
 from dln_jax.data import schema
 from dln_jax.options import CompilationCache
@@ -34,6 +36,7 @@ SMALL = {
     "train_delan": f"--optimizer adam --precision f64 --steps 40 --width 4 --depth 1 --batch 64 {BARE}",
     "train_hnn_task": f"--optimizer adam --steps 2 {BARE}",
     "export_c": "",
+    "identify": f"--no-uncertainty {BARE}",
 }
 """Put behind what a page gives, so that a command runs for a second: what is printed there stays as it is."""
 QUICKLY = "__import__('dln_jax.precision').precision._OPTIONS = {}; "
@@ -89,6 +92,10 @@ def workplace(folder):
     schema.save(folder / "mine.npz", data._replace(label=np.array([f"run{index}" for index in range(60)])))
     swings = generators.free_swing(pendulum(), trajectories=4, steps=60)
     np.savez(folder / "swings.npz", t=swings.t, q=swings.q, trajectory=swings.trajectory)
+    (folder / "arm.urdf").write_text(URDF)
+    log = motions(0, noise=0.05, samples=400, tree=read_robot(folder / "arm.urdf").tree)
+    titles = "t [s],q1 [rad],q2 [rad],tau1 [N m],tau2 [N m]"
+    np.savetxt(folder / "log.csv", np.column_stack([log.t, log.q, log.tau]), "%.9f", ",", header=titles, comments="")
     run(FIRST)
     return folder
 

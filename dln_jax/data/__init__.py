@@ -1,1 +1,1 @@
-"""Data: the file schema, readers and splits."""
+"""Recordings and robot files: the file schema, readers, checks, filters and splits."""

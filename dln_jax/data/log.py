@@ -170,7 +170,7 @@ def log_of(
         assume: trajectories -> assumed needs (default: revolute joints with gravity and friction).
         driven: whether torques drive the motions; free motions must have none, and keep their rates.
         cutoff: cut-off of the low-pass on q, Hz, from which rates follow; "auto" chooses it from the data, inf does not
-            filter q (default: the rates of the data; "auto" if it has none and q is noisy).
+            filter q (default: the rates of the data; "auto" if one is missing and q is noisy).
         decimate: with a cut-off, keep every n-th sample.
         check: run the checks for faults in users' data.
         settled: names of checks to ignore.
@@ -214,7 +214,7 @@ def log_of(
         )
     data = data._replace(needs=needs)
     findings = quick(data, robot) if check else []
-    noisy = [finding.observation for finding in findings if finding.check == NOISY and "qd" in data.estimated]
+    noisy = [finding.observation for finding in findings if finding.check == NOISY]
     smoothed = None
     if cutoff is not None or (noisy and driven):
         try:

@@ -1,1 +1,1 @@
-"""Exports of models: low-latency functions and C99 source."""
+"""Low-latency functions and C99 source of a model."""

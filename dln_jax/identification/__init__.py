@@ -1,5 +1,5 @@
-"""Identification: estimate the parameters of a robot and say which of them its data determine.
+"""Estimates the parameters of a robot, and says which of them its data determine.
 
 `identify(model, known, data)` does both for a model that is linear in its parameters, such as
-`models.trees.make_rigid_tree`.
+`make_rigid_tree`.
 """

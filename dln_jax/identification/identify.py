@@ -77,7 +77,7 @@ def identify(
     Bodies without mass (links between the joints of one MJCF body) stay massless.
 
     Args:
-        model: a linear model, for example from `models.trees.make_rigid_tree`.
+        model: a linear model, for example from `make_rigid_tree`.
         known: prior parameters, for example from a robot file; undetermined directions keep them.
         data: training data with tau; hold out other motions for the evaluation.
         joints: kinds of the joints, for drawing random states (default: all revolute).

@@ -166,7 +166,7 @@ def fit_motions(
     """Fits physically consistent parameters to motions, and to torques too if their equations are given.
 
     Args:
-        model: a model that is linear in its parameters, for example from `models.trees.make_rigid_tree`.
+        model: a model that is linear in its parameters, for example from `make_rigid_tree`.
         columns: columns of its parameters.
         prior: prior values, which undetermined directions keep.
         start: initial parameters with a positive definite mass matrix, for example consistent ones from torques.

@@ -61,7 +61,7 @@ def fit_residual(
     improves the tree, returns the tree's model and parameters without keywords.
 
     Args:
-        rigid: the tree, for example from `models.trees.make_rigid_tree`.
+        rigid: the tree, for example from `make_rigid_tree`.
         parameters: identified parameters, which stay fixed.
         needs: needs of the tree.
         train: training data of the tree.

@@ -1,4 +1,4 @@
-"""Learning: problems, objectives, and the one loop that solves them.
+"""Problems, objectives, and the one loop that solves them.
 
     training = fit(dynamics.problem(model, split(data)), GaussNewton())
 

@@ -64,7 +64,7 @@ class Terms(NamedTuple):
     cooling: bool = False
     """Whether viscous friction depends on temperature; the mean temperature of the log is the reference."""
     motors: Rows | None = None
-    """Like `coupled`, as for `models.trees.make_rigid_tree`."""
+    """Like `coupled`, as for `make_rigid_tree`."""
     coupled: tuple[Pair, ...] = ()
 
     @property

@@ -79,8 +79,8 @@ def fit_momentum(
     solution with its rank and condition number.
 
     Args:
-        model: linear in its parameters, such as `models.trees.make_rigid_tree` and
-            `models.trigonometric.make_trigonometric`.
+        model: linear in its parameters, such as `make_rigid_tree` and
+            `make_trigonometric`.
         data: samples at equal time steps, with smooth velocities and measured torques, from
             `data.encoders.smoothing.smooth`.
         window: length in s, at least `FEWEST` steps.

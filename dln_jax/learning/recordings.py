@@ -112,7 +112,7 @@ def delay_of_torques(model: Model, recording: Trajectories) -> float:
     whole number is rounded.
 
     Args:
-        model: model that is linear in its parameters, such as `models.trigonometric.make_trigonometric`.
+        model: model that is linear in its parameters, such as `make_trigonometric`.
         recording: q and the commanded torques.
 
     Raises:

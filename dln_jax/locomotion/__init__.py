@@ -1,1 +1,1 @@
-"""Locomotion of soft creatures: policies learned by gradients through the simulator."""
+"""Policies of soft creatures, learned by gradients through the simulator."""

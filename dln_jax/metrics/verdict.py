@@ -2,7 +2,7 @@
 
 The mean squared error e of a joint is compared with four numbers from the same samples: the variance v of its torque
 (the error of predicting the mean), its mean square z (the error of predicting zero), the variance n of its noise, and
-the error of the robot's own file. A joint is::
+the error of the robot's own file. A joint is:
 
     explained     e <= UNEXPLAINED v + NOISE n
     unexplained   e >= v: a constant would have done as well
@@ -19,7 +19,7 @@ A predicted motion escapes if a state is not finite, or if a momentum or positio
 measured magnitude. Angles may grow, since a pendulum can turn over. The error of a motion is the mean square over one
 period of the system, over measured columns, after the samples to which the start was fitted. Chaotic motions later
 diverge from any model. The unit of the error is the smallest error of four guesses without a model: rest, no force, the
-mean of the test motions, or the variance of the data::
+mean of the test motions, or the variance of the data:
 
     refused    a motion escapes, or the median error exceeds FAILED (an rms error of half the unit)
     doubtful   it exceeds UNEXPLAINED; MOTION_NOISE times the variance of the noise is added to both limits, but a

@@ -1,1 +1,1 @@
-"""Models: energies built from networks and bases for the needs of a scene."""
+"""Energies built from networks and bases for the needs of a scene."""

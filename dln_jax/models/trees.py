@@ -20,7 +20,7 @@ directions without effect ("gauges") are
 - the position of the base and its angle about the vertical: only the angle between first axis and gravity counts;
 - mirroring the whole arm, with axes as pseudo-vectors: torques cannot distinguish left-handed from right-handed arms.
 
-`learning.kinematics.fit_tree` fits these parameters.
+`learning.kinematics.fit.fit_tree` fits these parameters.
 """
 
 from collections.abc import Sequence
@@ -62,7 +62,7 @@ class RigidTreeParameters(NamedTuple):
     """All parameters of a tree of d joints; forces are linear in them. Absent friction is `None`."""
 
     inertias: Any
-    """[d, 10], as `mechanics.trees.PARAMETERS`."""
+    """[d, 10], as `mechanics.trees.inertia.PARAMETERS`."""
     armature: Any
     """[d], kg m² or kg."""
     viscous: Any = None
@@ -171,7 +171,7 @@ class SerialTreeParameters(NamedTuple):
     positions: Any
     """[d, 3], m."""
     inertias: Any
-    """[d, 10], as `mechanics.trees.PARAMETERS`; identifiable combinations, which need not be physically consistent."""
+    """[d, 10], as `mechanics.trees.inertia.PARAMETERS`; identifiable combinations, maybe physically inconsistent."""
     armature: Any
     """[d], kg m² or kg."""
     viscous: Any

@@ -1,1 +1,1 @@
-"""Networks: functions of x without physics."""
+"""Networks as functions of x, without physics."""

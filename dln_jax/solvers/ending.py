@@ -25,12 +25,12 @@ REASONS = {
     Ending.OUT_OF_ITERATIONS: "used up its iterations before it reached the tolerance; allow more, or start closer",
     Ending.NO_DESCENT: "found no step that improves; scale the problem, or start closer",
     Ending.NOT_FINITE: "met a number that is not finite; start closer, or bound the states and controls",
-    Ending.VIOLATED: "ended where constraints are violated (`control.worst_violation` names the worst); start closer, "
+    Ending.VIOLATED: "ended where constraints are violated (`worst_violation` names the worst); start closer, "
     "or make them soft",
-    Ending.INFEASIBLE: "is locally infeasible: no small change lowers the violation (`control.worst_violation` names "
+    Ending.INFEASIBLE: "is locally infeasible: no small change lowers the violation (`worst_violation` names "
     "the worst); change the limits, the horizon or the start",
     Ending.SADDLE: "ended at a saddle: all slopes vanish, but the cost curves down; start beside it",
-    Ending.EXCEEDED: "is optimal at its prices, but violates soft constraints (`control.worst_violation` names the "
+    Ending.EXCEEDED: "is optimal at its prices, but violates soft constraints (`worst_violation` names the "
     "worst); raise the prices, or make the constraints hard (soft=None)",
     Ending.UNDECIDED: "has not ended: a single iteration cannot tell",
 }

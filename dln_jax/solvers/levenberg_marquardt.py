@@ -130,7 +130,7 @@ def run(
 
 
 def in_chunks(arrays: Arrays, mesh: Mesh | None = None) -> Chunks:
-    """Returns the samples as chunks for `run_on_chunks`; `scale.mesh.shard` splits them over the devices.
+    """Returns the samples as chunks for `run_on_chunks`; `scale.shard` splits them over the devices.
 
     Raises:
         InputError: arrays differ in length.

@@ -111,7 +111,7 @@ def normal_equations(
 
     The sums are over all samples; the caller divides by their number. J is [k, blocks, P, rows of a block].
 
-    With a mesh, call it in a function of `scale.mesh.on_devices`: chunks and Jacobian belong to this device, the sums
+    With a mesh, call it in a function of `scale.on_devices`: chunks and Jacobian belong to this device, the sums
     to all devices.
     Reverse mode gives the rows, one residual at a time for all samples of a chunk; forward mode is used if a sample has
     at least as many residuals as there are parameters.

@@ -1,1 +1,1 @@
-"""The model zoo: models by name, their descriptions, and trained models saved to and loaded from folders."""
+"""Models by name, their descriptions, and trained models saved to and loaded from folders."""

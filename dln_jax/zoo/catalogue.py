@@ -92,8 +92,7 @@ def residual_network(make: Callable[[Needs], Model], needs: Needs, **keywords: A
 
 
 def make_stored_tree(needs: Needs, *, tree: dict[str, Any], **keywords: Any) -> Model:
-    """Calls `make_rigid_tree` with a tree from `mechanics.trees.description.tree_to_json` and the friction laws of the
-    needs."""
+    """Calls `make_rigid_tree` with a tree from `tree_to_json` and the friction laws of the needs."""
     frames = tree_from_json(tree)
     if (frames.joints, frames.needs.gravity) != (needs.joints, needs.gravity):
         raise InputError(

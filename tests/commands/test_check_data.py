@@ -68,7 +68,9 @@ def prepared(arrays, **changes):
 def test_a_log_is_filtered_by_default_only_where_noise_matters_and_rates_are_missing(log):
     cutoff, lines, causes = prepared(log)
     assert 3 < cutoff < 30 and causes == () and "q is filtered" in lines[0]
-    assert prepared(log, qd=np.gradient(log["q"], axis=0), qdd=log["tau"])[0] is None, "measured rates stay"
+    qd = np.gradient(log["q"], axis=0)
+    assert prepared(log, qd=qd)[0] == cutoff, "most robots log no qdd"
+    assert prepared(log, qd=qd, qdd=log["tau"])[0] is None, "measured rates stay"
     cutoff, lines, _ = prepared(log, q=np.sin(5 * log["t"] + log["trajectory"])[:, None])
     assert cutoff is None and not any("filtered" in line for line in lines), "exact data are used as they are"
     _, _, causes = prepared(log, q=np.degrees(log["q"]))

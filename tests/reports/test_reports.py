@@ -12,7 +12,7 @@ from calls import json_of
 
 from dln_jax.errors import InputError
 from dln_jax.files import write_json
-from scripts.report import NAMES, PAGE, fill_page, measured_below
+from scripts.report import NAMES, PAGE, TEMPLATES, fill_page, measured_below
 from scripts.reports import run
 from scripts.reports.run import AtLeast, Case, report
 
@@ -118,22 +118,24 @@ def test_an_interrupted_report_continues_with_what_was_measured(table, tmp_path,
         assert words in refused(table, capsys, "--out", folder, "--resume")
 
 
-def test_a_table_gets_the_numbers_that_were_measured(tmp_path):
+def test_a_table_gets_the_numbers_that_were_measured(tmp_path, monkeypatch):
     low = {"case": "low", "quantity": "error", "value": 2.34e-5, "reference": 0.1}
     rows = [low, {**low, "case": "high", "value": None, "reference": None}, {**low, "case": "lost", "quantity": "time"}]
     write_json(tmp_path / "report.json", {"conditions": {"report": "arm", "quick": True}, "rows": rows})
     with pytest.raises(InputError, match="has no report"):
         measured_below(tmp_path)
     write_json(tmp_path / "report.json", {"conditions": {"report": "arm", "quick": False}, "rows": rows})
-    comment = "<!-- report: arm\n| {* error} / {published * error} | {*/x error} |\nlow\nhigh\nlost\n-->\n\n"
-    table = "| | a | b |\n|---|---|---|\n| 1 | 3 | 4 |\n| 2 | 3 | 4 |\n| 3 | 3 | 4 |\n"
-    assert fill_page(comment + table, measured_below(tmp_path)).splitlines()[-3:] == [
+    cells = ["{* error} / {published * error}", "{*/x error}"]
+    monkeypatch.setitem(TEMPLATES, "arm/errors", [cells, ["low", "high", "lost"]])
+    table = "<!-- arm/errors -->\n\n| | a | b |\n|---|---|---|\n| 1 | 3 | 4 |\n| 2 | 3 | 4 |\n| 3 | 3 | 4 |\n"
+    assert fill_page(table, measured_below(tmp_path)).splitlines()[-3:] == [
         "| 1 | 2.3e-5 / 0.1 | 4 |",
         "| 2 | not finite | 4 |",
         "| 3 | 3 | 4 |",
     ]
 
 
-def test_tables_of_the_page_have_the_rows_and_columns_of_their_comments():
+def test_tables_of_the_page_have_the_rows_and_columns_of_their_templates():
     page = PAGE.read_text()
+    assert all(f"<!-- {name} -->" in page for name in TEMPLATES)
     assert fill_page(page, {name: {} for name in NAMES}) == page

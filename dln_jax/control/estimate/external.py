@@ -137,7 +137,7 @@ def flange_wrench(
     third is the norm of the torques that no wrench at the flange explains, N m or N: a contact elsewhere.
 
     Args:
-        jacobian: Jacobian of the flange's linear and angular velocity [6, d], by `mechanics.trees.frame_jacobian`.
+        jacobian: Jacobian of the flange's linear and angular velocity [6, d], by `frame_jacobian`.
         tau: external torques [d].
         length: length that makes moments comparable with forces, m.
         smallest: singular values of the scaled Jacobian below this share of the largest count as zero.
