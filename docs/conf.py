@@ -244,9 +244,7 @@ def to_rst(app, what, name, obj, options, lines):
 
 
 def escaped(line):
-    """A line with what reStructuredText would read as markup escaped, outside of `code` and examples."""
-    if line.lstrip().startswith((">>> ", "... ")):
-        return line
+    """A line with what reStructuredText would read as markup escaped, outside of `code`."""
     parts = re.split(r"(`[^`]*`)", line)
     return "".join(part if index % 2 else re.sub(r"([|*]|_(?!\w))", r"\\\1", part) for index, part in enumerate(parts))
 
