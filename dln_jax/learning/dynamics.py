@@ -123,9 +123,9 @@ def suited_network(needs: Needs, train: Trajectories) -> Suited:
     reason = f"{independent:,} independent equations for the {size:,} parameters of a small network"
     if independent > MOST_INDEPENDENT * size:
         large = {"width": 64, "depth": 2, "shared_trunk": False}
-        return Suited("adam", large, 6_000, None, f"{reason}: a large one holds more")
+        return Suited("adam", large, 6_000, None, f"{reason}, so a large network learns more")
     samples = ROWS_PER_PARAMETER * size // d
-    drawn = f"; {samples:,} of {len(train.t):,} samples are fitted" if samples < len(train.t) else ""
+    drawn = f"; {samples:,} of {len(train.t):,} samples are used" if samples < len(train.t) else ""
     return Suited("gauss-newton", small, 40, samples, reason + drawn)
 
 

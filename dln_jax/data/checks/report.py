@@ -180,7 +180,10 @@ def report(examined: Examination, name: str) -> list[str]:
     lines += ["", *_table(examined), ""]
     if on_tree is not None:
         determined = f"the motions determine {on_tree.rank} of {on_tree.parameters} parameters, friction included"
-        lines += [f"robot: {determined} (some are never determined alone); condition {on_tree.condition:.3g}", ""]
+        lines += [
+            f"robot: {determined} (some cannot be determined individually); condition {on_tree.condition:.3g}",
+            "",
+        ]
     if torques is not None:
         by = "a model near the robot's file" if on_tree is not None else "a generic arm model with friction"
         lines.append(
@@ -188,9 +191,9 @@ def report(examined: Examination, name: str) -> list[str]:
             f"likely delay is {torques.likely_delay:.2f} samples"
         )
     elif "tau" not in data.estimated:
-        lines.append("torques: signs, order of columns and delay cannot be checked in this log")
+        lines.append("torques: this log does not allow a check of signs, column order and delay")
     if not findings:
-        lines.append("nothing was found")
+        lines.append("no faults found")
     return [*lines, *(finding.line for finding in findings)]
 
 

@@ -79,7 +79,7 @@ class Smoothed(NamedTuple):
     left_out: int
     """Number of segments that were too short."""
     repeats: Repeats
-    """Repeated samples of the log, which were resampled over."""
+    """Repeated samples of the log, which were interpolated."""
     clock: Clock | None
     """Times of the source, if they replaced the stamps."""
 

@@ -125,7 +125,7 @@ def compare(
                 }
                 say(f"{name}: validation nMSE {nmse.mean():.3g}, worst joint {nmse.max():.3g}, {seconds:.1f} s")
                 return result, errors.mean(axis=1)
-            result = "its torques are not finite on validation motions"
+            result = "torques are not finite on validation motions"
         rows[name] = {"name": name, "validation_nmse": None, "seconds": seconds, "reason": result}
         say(f"{name}: {result}")
         return result, None

@@ -158,7 +158,9 @@ def refine(start: Fit, parts: Parts, context: Context) -> Fit:
     problem = dynamics.problem(start.model, parts.sets, start.objective)._replace(parameters=start.parameters)
     refit = train(problem, GaussNewton(steps=REFINEMENTS, improvement=1e-6), seconds=context.seconds, must_start=False)
     before = start.training
-    context.say(f"refined by both sides' errors: validation {before.validation:.2e}, after it {refit.validation:.2e}")
+    context.say(
+        f"refined by Gauss-Newton: validation error {before.validation:.2e} before, {refit.validation:.2e} after"
+    )
     training = refit if refit.validation < before.validation else before
     history = one_after_the_other([before.history, refit.history])
     training = training._replace(history=history, compile_seconds=refit.compile_seconds)

@@ -100,7 +100,7 @@ def plan_network(settings: Network, log: Log, parts: Parts, context: Context) ->
         chosen["steps"] = WITHOUT_STRUCTURE
     optimiser = optimiser_named(optimizer, precision=precision, **chosen)
     if needs != log.needs:
-        context.say("friction has no offset: the potential takes any constant")
+        context.say("friction has no offset term, since the potential can represent any constant force")
     if properties.canonical and objective.of_torques:
         context.say("no momenta p in the data: the Hamiltonian is fitted to torques")
     context.say(f"{name}, {precision}, {optimizer}{f' ({reason})' if reason else ''}")
@@ -191,7 +191,7 @@ def grow(target: float, plan: Fit, parts: Parts, context: Context) -> Fit:
             break
         # All processes have to agree.
         if fits and of_first_process(context.seconds <= SOON, context.mesh):
-            ended = f"out of time: networks of width {width} and more were not all tried"
+            ended = f"time is up; networks of width {width} and more were not all tried"
             break
         description = {**plan.description, "width": width, "depth": depth, "shared_trunk": shared}
         own = replace(plan, description=description, model=build(description))
@@ -215,5 +215,5 @@ def grow(target: float, plan: Fit, parts: Parts, context: Context) -> Fit:
     kept = min(met or range(len(fits)), key=lambda place: rows[place][key])
     say_selection(context, f"grown until the validation error is {target:g}", rows[kept]["name"], ended, rows)
     if not met:
-        context.say(f"no candidate meets {target:g}; kept is the most accurate. More --steps or --seconds may help")
+        context.say(f"no candidate meets {target:g}; the most accurate one is kept. More --steps or --seconds may help")
     return fits[kept]
