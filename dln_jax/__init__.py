@@ -1,22 +1,21 @@
 """Dynamics from energies: write or learn a scalar energy, get equations of motion, rollouts and controllers.
 
-This module gathers the most used names; all others are imported from the module that defines them. Functions take one
-state (`q, qd, qdd, tau` of shape [d], SI units): `jax.vmap` them over samples. The documentation has a page for every
-concept.
+`dln_jax` exports the most common names; import any other from the module that defines it. Functions take one state
+(`q, qd, qdd, tau` of shape [d], SI units); `jax.vmap` maps them over samples.
 """
 
 import importlib
 import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
-import dln_jax.process  # noqa: F401  first: an interrupt of the imports prints one word
+import dln_jax.process  # noqa: F401  first, so that Ctrl-C during the imports prints one word
 
 if TYPE_CHECKING:
     from dln_jax.public import *  # noqa: F403
 
 
 def __getattr__(name: str) -> Any:
-    """Imports the public names, and JAX with them, at first use: the help of a command needs neither."""
+    """Imports the public names on first use, so that the help of a command does not wait for JAX."""
     if name == "__version__":
         return importlib.metadata.version("dln-jax")
     if name.startswith("__") and name != "__all__":

@@ -12,7 +12,7 @@ from pathlib import Path
 from dln_jax.commands import COMMANDS
 
 BEGAN = time.perf_counter()
-"""Start of the process, from which `--seconds` counts."""
+"""Start of the process; `--seconds` counts from here."""
 
 
 def command(name: str, prog: str = "") -> None:
@@ -20,13 +20,13 @@ def command(name: str, prog: str = "") -> None:
 
     Args:
         name: name of a module in `dln_jax.commands`.
-        prog: the command as the user typed it, for help and messages (default: that of a checkout).
+        prog: the command as the user typed it, for help and messages (default: `python -m scripts.NAME`).
     """
-    # Factorisations here are small, and OpenBLAS's threads spin while they wait: a step of 560 tetrahedra took 4 to 20
-    # times the processor time of one thread. OpenBLAS reads the variable when SciPy is imported.
+    # Factorisations here are small, and idle OpenBLAS threads spin: a step of 560 tetrahedra took 4 to 20 times the
+    # processor time of one thread. OpenBLAS reads the variable when SciPy is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     prog = prog or f"python -m scripts.{name}"
-    sys.argv[0] = prog  # reports state the command that made them
+    sys.argv[0] = prog  # reports record the command
     try:
         from dln_jax.runs.running import run
 

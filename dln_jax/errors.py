@@ -1,7 +1,7 @@
-"""What is refused: users' mistakes, and counts, magnitudes and memory beyond upper bounds. Imports no JAX.
+"""Errors for invalid input, and upper bounds on counts, magnitudes and memory. Does not import JAX.
 
-The bounds are far above any sensible use: a typo must not exhaust the memory or run for years. Counts that multiply
-(cells of a mesh, equations of Gauss-Newton) are bounded by an estimate of their memory before anything is allocated.
+The bounds are far above any sensible use, but keep a typo from exhausting the memory or running for years. Counts that
+multiply (cells of a mesh, equations of Gauss-Newton) are bounded by an estimate of their memory before allocation.
 """
 
 import os
@@ -14,7 +14,7 @@ MOST: dict[str, int] = {
     "cells": 10_000,
     "decimate": 100_000,
     "degree": 50,
-    "depth": 100,  # more hidden layers take hours to compile, and learn nothing
+    "depth": 100,  # deeper networks take hours to compile and do not learn
     "devices": 256,
     "dimension": 3,
     "gpus": 256,
@@ -46,7 +46,18 @@ LARGEST_STATED = 1e20
 
 
 class InputError(ValueError):
-    """Invalid user input; the message states what was wrong, what was expected and what to do."""
+    """Invalid input: the message states in one line what was wrong, what was expected and what to do.
+
+    A `ValueError`. Commands print the message and end with status 2.
+
+    Example:
+        >>> import dln_jax
+        >>> try:
+        ...     dln_jax.load_trajectories("missing.npz")
+        ... except dln_jax.InputError as error:
+        ...     print(error)
+        missing.npz: no such file; give the path of the data
+    """
 
 
 class FitRefused(Exception):
@@ -93,11 +104,11 @@ def require_memory(what: str, bytes_needed: float) -> None:
     """Raises `InputError` if an estimate exceeds the memory of this machine."""
     if bytes_needed > (available := memory()):
         needed, here = (f"{size / 2**30:,.3g} GiB" for size in (bytes_needed, available))
-        raise InputError(f"{what} would take about {needed} of memory, and there are {here} here; ask for less")
+        raise InputError(f"{what} would need about {needed} of memory, but this machine has {here}; ask for less")
 
 
 def memory() -> float:
-    """Memory of this machine or container, whichever is less, bytes; infinite if the system does not report it."""
+    """Memory of this machine or its container, whichever is smaller, in bytes; infinite if unknown."""
     size = float("inf")
     try:
         size = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))

@@ -24,7 +24,7 @@ PARTIAL = ".partial"
 def writing(path: Path) -> Iterator[Path]:
     """Yields the path of a new file beside `path` to write to; it replaces `path` if the block raises nothing.
 
-    The file is created exclusively under a unique name: it follows no link and does not disturb other writers.
+    The new file has a unique name and is created exclusively, so it follows no link and does not disturb other writers.
 
     Raises:
         InputError: the folder is missing or not writable, or the disk is full.
@@ -50,7 +50,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
-    """Writes JSON atomically; numbers that are not finite, which JSON lacks, become null. Errors as `writing`."""
+    """Writes JSON atomically; infinities and NaN become null. Errors as `writing`."""
     write_bytes(path, json.dumps(finite(values), indent=2, allow_nan=False).encode() + b"\n")
 
 
@@ -70,7 +70,7 @@ def finite(values: Any) -> Any:
 
 
 def is_file(path: Path) -> bool:
-    """Whether the file exists; False for a name that the system does not allow, such as one that is too long."""
+    """Whether the file exists; False for a name that the system forbids, such as one that is too long."""
     try:
         return path.is_file()
     except OSError:
@@ -78,7 +78,7 @@ def is_file(path: Path) -> bool:
 
 
 def is_folder(path: Path) -> bool:
-    """Whether the folder exists; False for a name that the system does not allow."""
+    """Whether the folder exists; False for a name that the system forbids."""
     try:
         return path.is_dir()
     except OSError:
@@ -141,7 +141,7 @@ def cache_folder() -> Path:
     try:
         base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     except RuntimeError:  # from `Path.home`
-        raise InputError("this user has no home folder; set XDG_CACHE_HOME to a folder for programs") from None
+        raise InputError("this user has no home folder; set XDG_CACHE_HOME to a writable folder") from None
     folder = Path(base) / "dln_jax"
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Marks of options, and options that several commands share. Importing them does not import JAX."""
+"""Annotations for options, and options that several commands share. Does not import JAX."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ T = TypeVar("T")
 Unstated = Annotated[T | None, tyro.conf.arg(help_behavior_hint="")]
 """An option that is `None` by default; its help text states the effective default."""
 InPython = Annotated[T, tyro.conf.Fixed, tyro.conf.Suppress]
-"""A keyword that is no option of the command line."""
+"""A keyword for Python only, hidden from the command line."""
 
 
 def choice(names: Iterable[str], *, several: bool = False, unstated: bool = False) -> Any:

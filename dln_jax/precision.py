@@ -35,12 +35,12 @@ def require_precision(precision: Any) -> None:
 def require_double_precision(what: str) -> None:
     """Raises `InputError` that states how to enable double precision, if JAX computes in 32 bits.
 
-    The caller has to enable it: the setting affects the whole process, with the caller's arrays, `vmap` and `grad`.
+    The library does not enable it itself, because the setting affects the caller's own arrays and functions too.
     """
     if not jax.config.read("jax_enable_x64"):
         raise InputError(
-            f"{what} needs double precision, which JAX leaves off; "
-            'add `jax.config.update("jax_enable_x64", True)` behind the imports'
+            f"{what} needs double precision, which JAX disables by default; "
+            'add `jax.config.update("jax_enable_x64", True)` after the imports'
         )
 
 
@@ -54,9 +54,9 @@ def require_float64(precision: str) -> None:
 def computing_in(precision: str) -> Iterator[None]:
     """Runs JAX in f32 or f64, regardless of its setting.
 
-    JAX caches a NumPy array that a function closes over in the precision of its first use (as of 0.11, by the array's
-    identity), so a function jitted in both precisions gets constants of the wrong one. If the precision differs from
-    the setting, JAX's caches are therefore cleared on entry and exit. Traced programs must not outlive the context.
+    JAX (as of 0.11) caches each NumPy array that a function closes over, by identity and in the precision of its first
+    use. A function jitted in both precisions would get constants of the wrong one, so JAX's caches are cleared on entry
+    and exit if the precision differs from the setting. Traced programs must not outlive the context.
     """
     differs = jax.config.read("jax_enable_x64") != (precision == "f64")
     if differs:
@@ -89,7 +89,7 @@ def with_float64(parameters: Any) -> Any:
 
 
 def quick_compilation() -> dict[str, Any]:
-    """Compiler options for `jax.jit` and `compile` that shorten compilation, as far as the installed XLA knows them.
+    """Returns compiler options for `jax.jit` and `compile` that shorten compilation, if the installed XLA has them.
 
     With jaxlib 0.10.2 they cut the compilation time of a network's residuals by 40 % and its speed by at most 5 %; the
     optimisation level alone does not. jaxlib 0.11 cannot turn off the fusion emitters, and 10 % remain. Empty if the
@@ -99,7 +99,7 @@ def quick_compilation() -> dict[str, Any]:
 
 
 def compiled(function: Callable[..., Any]) -> Any:
-    """`jax.jit` for programs that run once or twice each, with quick compilation."""
+    """Applies `jax.jit` with quick compilation, for programs that run once or twice."""
     return jax.jit(function, compiler_options=quick_compilation())
 
 

@@ -1,7 +1,7 @@
-"""The process of a command: its interrupts, standard streams and time limit.
+"""Interrupts, standard streams and time limit of a command's process.
 
-An interrupt prints one word instead of a traceback, and does not break a checkpoint being stored. `--seconds` counts
-from the start of the process until the model is stored.
+An interrupt prints one word instead of a traceback, and never damages a checkpoint. `--seconds` counts from the start
+of the process until the model is stored.
 """
 
 import contextlib
@@ -19,12 +19,12 @@ from types import FrameType, TracebackType
 from typing import Any
 
 SOON = 1e-3
-"""Seconds that count as left after the deadline: a fit needs a positive number, and then does one dispatch."""
+"""Seconds left that are reported after the deadline; a fit needs a positive limit, and then does one dispatch."""
 _began: ContextVar[float | None] = ContextVar("began", default=None)
 
 
 def in_a_word(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Replaces `sys.excepthook`, so that an interrupt while a command is being imported prints no traceback."""
+    """Replaces `sys.excepthook`, so that an interrupt during the imports prints no traceback."""
     if issubclass(kind, KeyboardInterrupt):
         print("interrupted", file=sys.stderr)
     else:
@@ -32,7 +32,7 @@ def in_a_word(kind: type[BaseException], error: BaseException, trace: TracebackT
 
 
 def is_command() -> bool:
-    """Whether this process runs `dln-jax`, `python -m dln_jax` or `python -m scripts.NAME`, and no other program."""
+    """Whether this process runs `dln-jax`, `python -m dln_jax` or `python -m scripts.NAME`."""
     words = sys.orig_argv
     package, _, name = words[words.index("-m") + 1 :][0].partition(".") if "-m" in words[:-1] else ("", "", "")
     script = package == "scripts" and (Path(__file__).parents[1] / "scripts" / f"{name}.py").is_file()
@@ -43,8 +43,8 @@ def is_command() -> bool:
 def held_back() -> Iterator[None]:
     """Delays SIGINT and SIGTERM to the end of the block, such as a training step and its checkpoint.
 
-    Python raises an interrupt only when a compiled program returns, so this delays it by the checkpoint alone. Has no
-    effect outside the main thread, which alone may set signal handlers.
+    Python raises an interrupt only when a compiled program returns, so the block adds only the time of its checkpoint.
+    Has no effect outside the main thread, because only the main thread may set signal handlers.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -69,7 +69,7 @@ def held_back() -> Iterator[None]:
 
 
 def open_standard_streams() -> None:
-    """Opens standard streams that were closed (`>&-`) on the null device, and prints any text in any encoding."""
+    """Opens closed standard streams (`>&-`) on the null device, and makes any text printable in any encoding."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             os.dup2(os.open(os.devnull, os.O_RDWR), number)  # keeps the descriptor for it
@@ -81,7 +81,7 @@ def open_standard_streams() -> None:
 
 @contextlib.contextmanager
 def counting_from(began: float) -> Iterator[None]:
-    """Counts the deadlines of a command from this reading of `time.perf_counter`."""
+    """Makes `deadline` count from this reading of `time.perf_counter` within the block."""
     token = _began.set(began)
     try:
         yield
@@ -90,7 +90,7 @@ def counting_from(began: float) -> Iterator[None]:
 
 
 def deadline(seconds: float | None) -> float:
-    """The reading of `time.perf_counter` at which the time is up; infinite without a limit.
+    """Returns the reading of `time.perf_counter` at which the time is up; infinite without a limit.
 
     Outside a command the seconds count from now.
     """

@@ -23,11 +23,11 @@ def rollout(
     Args:
         step: (state, input) -> (state, info); parameters are closed over, as by `functools.partial(step, params)`.
         state: initial state; any tree of arrays. A step must keep their shapes and types.
-        inputs: inputs of the steps along the leading axis, [steps, ...], or `None` with `steps`.
+        inputs: one input per step on the leading axis, [steps, ...]; or `None`, and give `steps`.
         steps: number of steps, if there are no inputs.
         observe: (state, info) -> values to keep, by default the state; unused parts of `info` are not computed.
-        segment: steps between the states that reverse mode stores. The steps between them are computed twice, and
-            memory grows with steps / segment + segment. Must divide the number of steps. By default all is stored.
+        segment: reverse mode stores one state every `segment` steps and recomputes the others, so memory grows with
+            steps / segment + segment. Must divide the number of steps. By default every state is stored.
 
     Raises:
         InputError: neither inputs nor steps, or a segment that does not divide the number of steps.
@@ -35,7 +35,7 @@ def rollout(
     leaves = jax.tree.leaves(inputs)
     count = leaves[0].shape[0] if leaves else steps
     if count is None:
-        raise InputError("there are neither inputs nor steps; give one of them")
+        raise InputError("neither inputs nor steps were given; give one of them")
     if not leaves:
         require_positive(steps=count)
 

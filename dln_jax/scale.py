@@ -1,12 +1,11 @@
-"""One program on several devices and in several processes.
+"""Runs one program on several devices and in several processes.
 
-A mesh has one axis. Shared arrays, such as parameters, are replicated on every device; a batch is split along axis 0,
-and a device computes its share. `spread` gathers the results in the order of the batch, so that the rest of a program
-does not depend on the number of devices. A function in `on_devices` calls the collectives `total`, `mean` and `first`
-itself; sums are taken in an order, and so with rounding errors, that depend on the number of devices. Without a mesh
-(`None`), all of these return the function or the arrays unchanged.
+A mesh with a single axis splits every batch along axis 0 and replicates shared arrays, such as parameters, on every
+device. `spread` gathers the results in batch order, so the rest of a program does not depend on the number of devices.
+Functions run by `on_devices` call the collectives `total`, `mean` and `first` themselves. The order of their sums, and
+therefore the rounding, depends on the number of devices. With no mesh (`None`) all of these return their argument.
 
-`jax.distributed` connects the processes (`membership`, `join`), and ends them when one is lost.
+`membership` and `join` connect processes through `jax.distributed`, which ends all of them when one is lost.
 """
 
 import contextlib
@@ -36,32 +35,32 @@ from dln_jax.errors import InputError, ProcessLost
 
 REPETITIONS = 5
 EXPENSIVE = 4.0
-"""Above this cost of float64, relative to float32, a user is advised to consider float32."""
+"""Time of float64 relative to float32 above which a training recommends float32."""
 AXIS = "batch"
-"""Name of the mesh's one axis."""
+"""Name of the mesh axis."""
 SPLIT, WHOLE = PartitionSpec(AXIS), PartitionSpec()
 
 OfBatch = Callable[[Any, Any], Any]
 """(shared arrays, batch on axis 0 of every leaf) -> results."""
 HEARTBEAT = 10
-"""After this many seconds without a heartbeat JAX treats a process as lost and ends the others."""
+"""Seconds without a heartbeat after which JAX treats a process as lost and ends the others."""
 SHUTDOWN = 300
-"""Seconds that the processes may take to shut down; process 0 may still write its figures."""
+"""Time limit for the shutdown of all processes, s; process 0 may still be writing figures."""
 JOINING = 120
 """Time limit for the start of all processes, s."""
 MOST_OPTIONS = 256
-"""Largest number of options and versions that the processes compare."""
+"""Largest number of options and versions compared between processes."""
 _TASKS = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
-"""Environment variables of `srun` and `mpirun` that state the number of their processes."""
+"""Environment variables in which `srun` and `mpirun` state their number of processes."""
 _ADDRESS = re.compile(r"(\[[0-9a-fA-F:.%\w]+\]|[^\s:\[\]/]+):(\d{1,5})", re.ASCII)
 _OF_PEERS = re.compile(r"gloo|nccl|coordination|unavailable|deadline_exceeded", re.IGNORECASE)
 
 
 def batch_mesh(devices: int | None = None) -> Mesh | None:
-    """Returns the mesh of the devices that share batches, or `None` for a single device.
+    """Returns a mesh that splits batches over devices, or `None` for a single device.
 
     Args:
-        devices: number of devices of every process; default: all that JAX sees.
+        devices: number of devices per process (default: every device that JAX sees).
 
     Raises:
         InputError: a process has fewer devices.
@@ -76,7 +75,7 @@ def batch_mesh(devices: int | None = None) -> Mesh | None:
 
 
 def shares(mesh: Mesh | None, count: int, what: str) -> int:
-    """Returns the number of items (`what`, plural) per device; `InputError` if the devices do not divide `count`."""
+    """Returns the number of items (`what`, plural) per device; `InputError` unless it is a whole number."""
     devices = 1 if mesh is None else mesh.size
     if count % devices:
         remedy = f"give a multiple of {devices}, or fewer devices"
@@ -85,7 +84,7 @@ def shares(mesh: Mesh | None, count: int, what: str) -> int:
 
 
 def shard(tree: Any, mesh: Mesh | None) -> Any:
-    """Splits arrays along axis 0; all processes pass the same whole arrays, and keep their part.
+    """Splits arrays along axis 0 over the devices; every process passes the whole arrays and keeps its own part.
 
     Raises:
         InputError: the number of devices does not divide the length of an array.
@@ -117,18 +116,18 @@ def local(tree: Any, mesh: Mesh | None) -> Any:
 
 
 def of_first_process(value: bool | float, mesh: Mesh | None) -> bool | float:
-    """Returns process 0's value of a number that may differ between processes, such as a time."""
+    """Returns the value of process 0 in every process, for numbers that may differ, such as times."""
     if mesh is None or jax.process_count() == 1:
         return value
-    # A gather over all devices reuses their connections; a broadcast would have to make others.
+    # A gather over all devices reuses their connections; a broadcast would open new ones.
     return type(value)(multihost_utils.process_allgather(shard(np.full(mesh.size, value), mesh), tiled=True)[0])
 
 
 def spread(function: OfBatch, mesh: Mesh | None) -> OfBatch:
-    """Returns the function with the batch split over the devices; all devices get all results.
+    """Splits the batch of a function over the devices; every device gets all results.
 
-    The function must treat samples independently, as `vmap` does: a batch that the number of devices does not divide is
-    padded with its first sample, whose results are dropped. The result is differentiable in forward mode; take
+    The function must treat samples independently, as `vmap` does. If the number of devices does not divide the batch,
+    copies of its first sample pad it and their results are dropped. The result is differentiable in forward mode; take
     reverse-mode derivatives inside the function.
     """
     if mesh is None:
@@ -150,9 +149,10 @@ def spread(function: OfBatch, mesh: Mesh | None) -> OfBatch:
 
 
 def on_devices(function: OfBatch, mesh: Mesh | None) -> OfBatch:
-    """Runs a function on every device's share; it must return the same on all, by `total`, `mean` or `first`.
+    """Runs a function on the part of the batch that each device holds.
 
-    The number of devices must divide the batch. Conditions of loops and branches with collectives must agree on all.
+    The function must return the same values on all devices, which `total`, `mean` and `first` ensure. The number of
+    devices must divide the batch. Loops and branches that contain collectives must take the same course on all devices.
     """
     if mesh is None:
         return function
@@ -163,22 +163,22 @@ def on_devices(function: OfBatch, mesh: Mesh | None) -> OfBatch:
 
 
 def total(tree: Any, mesh: Mesh | None) -> Any:
-    """Returns the sum over devices, within a function of `on_devices`."""
+    """Returns the sum over devices; call it within `on_devices`."""
     return tree if mesh is None else lax.psum(tree, AXIS)
 
 
 def mean(tree: Any, mesh: Mesh | None) -> Any:
-    """Returns the mean over devices, within a function of `on_devices`."""
+    """Returns the mean over devices; call it within `on_devices`."""
     return tree if mesh is None else lax.pmean(tree, AXIS)
 
 
 def first(tree: Any, mesh: Mesh | None) -> Any:
-    """Returns the first device's values, within a function of `on_devices`; other devices may round differently."""
+    """Returns the first device's values, since other devices may round differently; call it within `on_devices`."""
     return tree if mesh is None else jax.tree.map(lambda leaf: lax.all_gather(leaf, AXIS)[0], tree)
 
 
 def share(array: jax.Array, mesh: Mesh | None, *, axis: int) -> jax.Array:
-    """Returns this device's part of a replicated array along an axis, within a function of `on_devices`."""
+    """Returns this device's part of a replicated array along an axis; call it within `on_devices`."""
     if mesh is None:
         return array
     size = array.shape[axis] // mesh.size
@@ -186,9 +186,9 @@ def share(array: jax.Array, mesh: Mesh | None, *, axis: int) -> jax.Array:
 
 
 def _with_empty_arrays_made_inside(function: OfBatch) -> OfBatch:
-    """Returns the function with its empty arguments and constants created inside.
+    """Creates empty arguments and constants inside the function instead of passing them.
 
-    XLA of jaxlib 0.11.2 removes empty inputs of a `shard_map` and crashes on the remaining ones (docs/scale.md).
+    In jaxlib 0.11.2, XLA removes the empty inputs of a `shard_map` and then crashes on the others (docs/scale.md).
     """
 
     def on_one(shared: Any, batch: Any) -> Any:
@@ -207,7 +207,7 @@ def _made_if_empty(tree: Any) -> Any:
 
 def _placed(tree: Any, sharding: NamedSharding) -> Any:
     def place(leaf: Any) -> jax.Array:
-        # Made here from this process's copy: `device_put` would compare the copies of all processes first.
+        # Built from this process's copy, because `device_put` would first compare the copies of all processes.
         array = np.asarray(leaf)
         return jax.make_array_from_callback(array.shape, sharding, lambda index: jnp.asarray(array[index]))
 
@@ -215,11 +215,11 @@ def _placed(tree: Any, sharding: NamedSharding) -> Any:
 
 
 Membership = tuple[str | None, int | None, int | None]
-"""host:port of process 0, number of processes, and index of this one; if all are `None`, the cluster states them."""
+"""host:port of process 0, number of processes, index of this process; all `None` if JAX asks the cluster for them."""
 
 
 def host_devices(count: int | None) -> None:
-    """Splits the CPU into `count` JAX devices, unless it is None or JAX runs already; `InputError` below 1."""
+    """Splits the CPU into `count` JAX devices if JAX has not started yet; `InputError` below 1."""
     if count is None:
         return
     if count < 1:
@@ -231,13 +231,13 @@ def host_devices(count: int | None) -> None:
 def membership(
     processes: int | None, coordinator: str | None, process: int | None, environ: Mapping[str, str] = os.environ
 ) -> Membership | None:
-    """Returns how this process joins others, or `None` for a single process.
+    """Returns the arguments with which this process joins the others, or `None` for a single process.
 
     Args:
-        processes: number of processes; 1 means a single process, also within a cluster's step.
-        coordinator: host:port of process 0; an IPv6 address stands in brackets.
+        processes: number of processes; 1 means a single process, also under `srun` and `mpirun`.
+        coordinator: host:port of process 0, with an IPv6 address in brackets.
         process: index of this process, from 0.
-        environ: environment with the variables of `srun` or `mpirun`, read if all other arguments are None.
+        environ: environment variables; those of `srun` and `mpirun` count if all other arguments are `None`.
 
     Raises:
         InputError: an argument is missing or out of range.
@@ -248,7 +248,7 @@ def membership(
         raise InputError(f"--processes is {processes}; expected a positive whole number")
     if processes == 1:
         if len(absent) < 2:
-            raise InputError("--processes is 1, which needs no --coordinator and no --process-id; leave them out")
+            raise InputError("--processes is 1; leave out --coordinator and --process-id")
         return None
     if len(absent) == len(options):
         return (None, None, None) if any(environ.get(name, "1") != "1" for name in _TASKS) else None
@@ -264,21 +264,21 @@ def membership(
 
 
 def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINING) -> None:
-    """Connects this process to the others; JAX must not have been used before.
+    """Connects this process to the others; call it before any other use of JAX.
 
     Args:
-        member: how this process joins.
-        options: JSON values by name that decide the result; they must be equal in all processes.
+        member: from `membership`.
+        options: JSON values by name that affect the result; they must be equal in all processes.
         seconds: time limit for the start of all processes.
 
     Raises:
-        InputError: the address cannot be used, a process is missing, or two differ. JAX may go on connecting in a
-            thread, so that the caller should end the process at once.
+        InputError: the address cannot be used, a process is missing, or two processes differ. End the process at once,
+            because a thread of JAX may still be trying to connect.
     """
     coordinator, processes, process = member
     where = coordinator or "the cluster"
     claim = _claimed_address(coordinator, process)
-    # JAX's handler of SIGTERM would keep a process alive that is asked to end.
+    # JAX's SIGTERM handler would keep the process alive.
     jax.config.update("jax_enable_preemption_service", False)
     errors = []
 
@@ -293,7 +293,7 @@ def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINI
         except (RuntimeError, ValueError) as error:
             errors.append(error)
 
-    # When JAX's own time for this is up, it aborts the process with a C++ trace. Ctrl-C would have to wait for it, too.
+    # At its own time limit JAX aborts the process with a C++ trace. In the main thread it would also delay Ctrl-C.
     thread = threading.Thread(target=connect, daemon=True)
     thread.start()
     thread.join(seconds)
@@ -302,7 +302,7 @@ def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINI
         count = "the processes" if processes is None else f"the {processes} processes"
         raise InputError(
             f"{count} did not meet at {where} within {seconds} s; start the same command once for each --process-id, "
-            "with an address of process 0's host that all can reach"
+            "with an address of process 0 that every host can reach"
         )
     if errors:
         raise InputError(f"cannot join {where}: {_first_line(errors[0])}")
@@ -315,10 +315,10 @@ def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINI
 
 
 def _claimed_address(coordinator: str | None, process: int | None) -> contextlib.ExitStack:
-    """Returns what keeps other processes 0 away until it is closed.
+    """Reserves the address of process 0 until the returned stack is closed.
 
     Raises:
-        InputError: the host has no address, or the port is not free; JAX would wait in both cases.
+        InputError: the host name does not resolve, or the port is in use; JAX would wait in both cases.
     """
     if coordinator is None:
         return contextlib.ExitStack()
@@ -328,8 +328,8 @@ def _claimed_address(coordinator: str | None, process: int | None) -> contextlib
             if process:
                 socket.getaddrinfo(host.strip("[]"), int(port))
             else:
-                # JAX's servers share a port, and a process that finds another of its index aborts. The UDP port has one
-                # owner until JAX listens.
+                # Two servers of JAX can share a TCP port, and JAX then aborts the second process 0. A UDP port has a
+                # single owner, so it guards the address until JAX listens.
                 claim.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)).bind(("", int(port)))
                 socket.create_server(("", int(port))).close()
             return claim.pop_all()
@@ -340,7 +340,7 @@ def _claimed_address(coordinator: str | None, process: int | None) -> contextlib
 
 
 def _difference(options: Mapping[str, Any]) -> str:
-    """Returns the first difference between the processes, the same in all of them; empty if there is none."""
+    """Describes the first difference between the processes; empty if there is none, and equal in all processes."""
     counts = Counter(device.process_index for device in jax.devices())
     for process, count in sorted(counts.items()):
         if count != counts[0]:
@@ -359,7 +359,7 @@ def _difference(options: Mapping[str, Any]) -> str:
 
 @contextlib.contextmanager
 def losses_named(remedy: str) -> Iterator[None]:
-    """Turns the error of a collective whose peer is lost into a `ProcessLost` that ends with a remedy."""
+    """Raises `ProcessLost`, with this remedy, if a collective fails because another process is lost."""
     try:
         yield
     except (RuntimeError, ValueError) as error:
@@ -373,10 +373,10 @@ def _first_line(error: BaseException) -> str:
 
 
 def backend_started() -> bool:
-    """Returns whether JAX has started a backend, which any array or list of devices does."""
-    devices = getattr(jax.config, "jax_num_cpu_devices")  # noqa: B009  JAX adds its settings as it starts
+    """Whether JAX has started a backend; the first array or list of devices starts it."""
+    devices = getattr(jax.config, "jax_num_cpu_devices")  # noqa: B009  JAX defines its settings at run time
     try:
-        # JAX refuses another number of devices once a backend runs: the public way to learn whether one does.
+        # JAX has no public query for this, but it refuses to change the number of devices once a backend runs.
         jax.config.update("jax_num_cpu_devices", devices + 2)
         jax.config.update("jax_num_cpu_devices", devices)
     except RuntimeError:
@@ -385,25 +385,25 @@ def backend_started() -> bool:
 
 
 def unusable_platform() -> str | None:
-    """Returns a message if JAX cannot start the platforms that the user asks for, else None."""
+    """Returns a message if JAX cannot start the platforms in JAX_PLATFORMS, else None."""
     requested = getattr(jax.config, "jax_platforms")  # noqa: B009  as above
     try:
         jax.devices()
     except (RuntimeError, AssertionError):  # AssertionError: JAX knows the platform but has no library for it
         return (
-            f"JAX cannot start '{requested}' here, which JAX_PLATFORMS asks for; leave it unset for what there is, "
-            "or install JAX for it (pip install 'jax[cuda12]' for NVIDIA)"
+            f"JAX cannot start '{requested}', the value of JAX_PLATFORMS, on this machine; unset it to use any "
+            "available platform, or install JAX for it (pip install 'jax[cuda12]' for NVIDIA)"
         )
     return None
 
 
 def double_precision_cost(rows: int = 2048) -> float:
-    """Measures the time of a float64 matrix product relative to float32, on the first device, in about a second.
+    """Measures the time of a float64 matrix product relative to float32 on the first device; takes about a second.
 
     Typical values are 1 to 2 on CPUs and data-centre GPUs, and 32 or 64 on graphics cards.
 
     Args:
-        rows: size of the square matrices; 2048 rows take 17 GFlop, enough to fill any device.
+        rows: size of the square matrices; 2048 rows need 17 GFlop, which keeps any device busy.
     """
 
     def seconds(dtype: Any) -> float:
@@ -419,10 +419,10 @@ def double_precision_cost(rows: int = 2048) -> float:
 
 
 def device_lines(precision: str) -> list[str]:
-    """Returns the lines that a training prints about its device, such as "1 gpu (NVIDIA H200)"; none on a CPU.
+    """Returns the device lines of a training's output, such as "1 gpu (NVIDIA H200)"; none on a CPU.
 
     Args:
-        precision: "f32" or "f64"; float64 adds a line where it is much slower than float32.
+        precision: "f32" or "f64"; f64 adds a line if float64 is much slower than float32 on this device.
     """
     if jax.default_backend() == "cpu":
         return []
@@ -433,6 +433,6 @@ def device_lines(precision: str) -> list[str]:
     if precision == "f64" and (cost := double_precision_cost()) >= EXPENSIVE:
         lines.append(
             f"float64 takes {cost:.0f} times as long as float32 on this device: Gauss-Newton and references need it, "
-            "networks by adam do not (--precision f32); a run may be faster on the processor (JAX_PLATFORMS=cpu)"
+            "Adam does not (--precision f32); the CPU may be faster (JAX_PLATFORMS=cpu)"
         )
     return lines

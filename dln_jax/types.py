@@ -30,11 +30,11 @@ Scalar = Float[Array, ""]
 Vector = Float[Array, "d"]
 Matrix = Float[Array, "d d"]
 JointVector = Float[np.ndarray, " d"]
-"""A number for each joint."""
+"""One number per joint."""
 JointSamples = Float[np.ndarray, "N d"]
 SampleVector = Float[np.ndarray, " N"]
 SampleIndex = Int[np.ndarray, " N"]
-"""An index for each sample, such as that of its trajectory."""
+"""One index per sample, such as the number of its trajectory."""
 
 VectorLike = ArrayLike | Sequence[ArrayLike]
 """Accepted types of a vector argument: an array, or a list or tuple of numbers."""
@@ -65,13 +65,13 @@ def require_positive(**numbers: int | float) -> None:
 
 
 def require_once(what: str, names: Sequence[str]) -> None:
-    """Raises `InputError` for a name that stands twice, since only one of its values would count."""
+    """Raises `InputError` for a repeated name, since only one of its values would count."""
     if twice := [name for place, name in enumerate(names) if name in names[:place]]:
         raise InputError(f"{what} names '{twice[0]:.60}' twice; expected once")
 
 
 def finite_array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Converts a value to a float64 array of this shape; `InputError` names a wrong type, shape or number."""
+    """Converts a value to a finite float64 array of this shape; `InputError` for a wrong type, shape or number."""
     try:
         array = np.asarray(value, float)
     except (TypeError, ValueError):
@@ -101,25 +101,34 @@ class _Needs(NamedTuple):
     joints: tuple[JointKind, ...]
     """Kinds of the joints: a revolute angle enters a model as cos and sin, a prismatic displacement unchanged."""
     gravity: bool = True
-    """Whether there is a potential V(q) (weight, springs)."""
+    """Whether the plant has a potential V(q) (weight, springs)."""
     friction: bool = False
-    """Whether there is a Rayleigh dissipation function D(q, qd)."""
+    """Whether the plant has a Rayleigh dissipation function D(q, qd)."""
     actuation: tuple[tuple[float, ...], ...] | None = None
     """Rows of the matrix B [d, u] in tau = B control; `None` if every coordinate has its own motor."""
     joint_friction: tuple[FrictionLaw, ...] = ()
-    """Laws of friction that act in every joint; `friction` is a learned dissipation of another form."""
+    """Friction laws of every joint; `friction` is a learned dissipation of general form instead."""
     joint_map: tuple[tuple[float, ...], ...] | None = None
-    """Rows of the matrix J [d, d] in joint rates = J qd, if the coordinates differ from the joints', such as angles
-    from the vertical; `None` if they are the same."""
+    """Rows of the matrix J [d, d] in joint rates = J qd, for coordinates that are not joint angles, such as angles from
+    the vertical; `None` if they are joint angles."""
     velocity_scale: float = 0.01
     """Velocity v of the joints' dry friction, rad/s or m/s; the law is smooth below it."""
 
 
 class Needs(_Needs):
-    """Terms that a scene needs; a term that is absent here is never built, traced or compiled.
+    """Joints of a plant and the terms in its equations of motion.
 
-    Hashable and made of plain Python values, so that it can be a static argument and a line of JSON. Raises
-    `InputError` for unknown kinds of joints or laws of friction, and for values of a wrong type.
+    Models never build, trace or compile a term that is absent here. The record is hashable and has plain Python values,
+    so it can be a static argument of `jax.jit` and can be stored as JSON.
+
+    Raises:
+        InputError: unknown kinds of joints or laws of friction, or values of a wrong type.
+
+    Example:
+        >>> import dln_jax
+        >>> needs = dln_jax.Needs(joints=("prismatic", "revolute"), joint_friction=("viscous", "coulomb"))
+        >>> print(needs.degrees_of_freedom, needs.gravity, needs.friction)
+        2 True False
     """
 
     __slots__ = ()
@@ -147,7 +156,7 @@ class Needs(_Needs):
 
 
 def _names_of(field: str, names: Any, known: tuple[str, ...]) -> tuple[Any, ...]:
-    """Names as a tuple; `InputError` for an unknown name."""
+    """Returns names as a tuple; `InputError` for an unknown name."""
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) and name in known for name in names):
         raise InputError(f"{field}: {reprlib.repr(names)}; expected a tuple of {', '.join(known)}")
     return tuple(names)

@@ -146,7 +146,7 @@ def test_a_parameter_of_a_scene_that_is_no_number_is_refused():
 
 def test_more_memory_than_there_is_is_refused_with_both_numbers():
     require_memory("little", 1e6)
-    with pytest.raises(InputError, match=r"much would take about .* GiB of memory, and there are .* GiB"):
+    with pytest.raises(InputError, match=r"much would need about .* GiB of memory, but this machine has .* GiB"):
         require_memory("much", 2 * min(memory(), 1e18))
     with pytest.raises(InputError, match="elements"):
         beam(1.0, 1.0, 100_000, 100_000)
@@ -172,7 +172,7 @@ def test_what_does_not_fit_is_refused_before_it_is_allocated(asked, estimate, mo
     monkeypatch.setattr(errors, "memory", lambda: estimate - 1.0)
     tracemalloc.start()
     try:
-        with pytest.raises(InputError, match=r"would take about .* GiB of memory.*ask for less") as caught:
+        with pytest.raises(InputError, match=r"would need about .* GiB of memory.*ask for less") as caught:
             asked()
         assert tracemalloc.get_traced_memory()[1] < estimate / 5
     finally:

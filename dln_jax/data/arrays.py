@@ -23,12 +23,12 @@ from dln_jax.types import InputError
 
 Data = TypeVar("Data")
 Reader = Callable[[Path], dict[str, Any]]
-"""Reader of a file or folder: arrays by key, and under `UNREAD` the names of what it does not read."""
+"""Reader of a file or folder: returns arrays by key, and under `UNREAD` the names that it skips."""
 
 MOST_BYTES = 4 * 2**30
 """Limit on all arrays of one file, since a small archive may expand a thousandfold."""
 UNREAD = "unread"
-"""Key of the names, such as titles of columns, that a reader leaves out."""
+"""Key for the names that a reader skips, such as column titles."""
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 """Header readers for the versions of NumPy's format that hold numbers and strings."""
 MOST_TIMES_TYPICAL = 1e20
@@ -45,7 +45,7 @@ def load_file(
 ) -> Data:
     """Reads the arrays with these keys, if present, and passes them to `from_arrays`, which checks them.
 
-    Names of what the file holds beside them are passed under `UNREAD`, so that they can be said.
+    The names of all other contents are passed under `UNREAD`, for a remark.
 
     Args:
         from_arrays: converts arrays by key into the result.
@@ -68,13 +68,13 @@ def load_file(
 
 
 def unread_line(arrays: Mapping[str, Any]) -> tuple[str, ...]:
-    """Remark that names what the file of these arrays holds beside them; empty if there is nothing else."""
+    """Returns a remark with the names of skipped contents; empty if nothing was skipped."""
     names = ", ".join(arrays.get(UNREAD, ()))
     return (f"not read: {names if len(names) <= 200 else f'{names[:200]}...'}",) if names else ()
 
 
 def _read(path: Path, keys: Sequence[str]) -> dict[str, Any]:
-    """The arrays of an npz file with these keys, and the names of all others."""
+    """Reads the arrays with these keys from an npz file, and the names of all others."""
     arrays: dict[str, Any] = {}
     room, key = MOST_BYTES, None
     try:
@@ -97,7 +97,7 @@ def _read(path: Path, keys: Sequence[str]) -> dict[str, Any]:
 
 
 def _array(file: Any, size: int, room: int) -> np.ndarray:
-    """Reads one array of an archive, whose entry has `size` bytes; more than `room` bytes are refused."""
+    """Reads one array from an archive entry of `size` bytes; `InputError` for more than `room` bytes."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about headers that Python 2 wrote
         shape, by_columns, dtype = HEADERS[np.lib.format.read_magic(file)](file)
@@ -108,7 +108,7 @@ def _array(file: Any, size: int, room: int) -> np.ndarray:
         raise InputError(f"has {size - file.tell()} bytes for shape {str(shape)[:60]} of {dtype}; write the file again")
     if expected > room:
         raise InputError(
-            f"has shape {str(shape)[:60]}: with it the file holds more than {MOST_BYTES >> 30} GiB; split the data"
+            f"has shape {str(shape)[:60]}, which makes the file larger than {MOST_BYTES >> 30} GiB; split the data"
         )
     data = file.read(expected)
     if len(data) != expected or file.read(1):
@@ -124,7 +124,7 @@ def numeric(
     to_match: str = "q",
     most: float = LARGEST,
 ) -> np.ndarray:
-    """The array with this key as float64, checked to hold finite real numbers.
+    """Returns the array with this key as float64, checked for finite real numbers.
 
     Raises:
         InputError: the key is missing, not numeric, not finite, has the wrong shape, or its largest number is so large
@@ -166,7 +166,7 @@ def on_device(name: str, array: np.ndarray, dtype: Any) -> Array:
 
 
 def spread(name: str, array: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"]:
-    """Standard deviation of each column, in float64.
+    """Returns the standard deviation of each column, in float64.
 
     Raises:
         InputError: squares overflow, nonzero squares all vanish, or numbers exceed `MOST_TIMES_TYPICAL` medians.

@@ -1,12 +1,12 @@
-"""Reads joint states from ROS bags: `sensor_msgs/JointState` of ROS 2 (sqlite, MCAP) and ROS 1, by rosbags.
+"""Reads joint states from ROS bags with rosbags: `sensor_msgs/JointState` of ROS 2 (sqlite, MCAP) and ROS 1.
 
 A message has a stamp, names, and positions, velocities and efforts in SI units, each empty or with one number per name.
-Every joint and quantity is a series of its own, so names may come in any order and be absent from some messages. The
-series are put on one clock by these rules:
+Each quantity of each joint is a separate series, so names may come in any order and be absent from some messages. Three
+rules put the series on one clock:
 
-- The clock is that of the slowest series; its stamps are the times of the log.
-- Positions and velocities of other series are interpolated by cubic splines, efforts linearly, since they may jump.
-- A time is left out unless every series has two messages around it at most `BRIDGED` of its median steps apart.
+- The stamps of the slowest series are the times of the log.
+- Cubic splines interpolate the positions and velocities of the other series; efforts, which may jump, are linear.
+- A time is left out unless the two messages of each series around it are at most `BRIDGED` median steps apart.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -20,18 +20,18 @@ from dln_jax.types import InputError, require_once
 
 SUFFIXES = (".db3", ".mcap", ".bag")
 METADATA = "metadata.yaml"
-"""File that makes a folder a ROS 2 bag."""
+"""File that marks a folder as a ROS 2 bag."""
 TYPE = "sensor_msgs/msg/JointState"
 FIELDS = {"position": "q", "velocity": "qd", "effort": "tau"}
 """Fields of a message, and their keys in the schema."""
 BRIDGED = 2.5
-"""Largest distance of two messages for interpolation, in median steps: one lost message is bridged."""
+"""Largest time between two messages for interpolation, in median steps: one lost message is bridged."""
 RESTART = 1_000_000_000
-"""Largest backward jump of stamps in ns (messages out of order); after a longer one, stamps are not used."""
+"""Largest backward jump of stamps in ns that counts as messages out of order; a longer jump discards the stamps."""
 INSTALL = "pip install 'dln-jax[bag]'"
 
 Selection = Callable[[Sequence[str]], Mapping[str, str]]
-"""Names in the log -> the joints to keep, in their order, with their new names."""
+"""Names in the log -> joints to keep, in order, with their new names."""
 Quantity = tuple[str, str]
 """A field and a joint."""
 Series = tuple[np.ndarray, np.ndarray, str]
@@ -43,7 +43,7 @@ def read(path: Path, *, topics: Sequence[str], select: Selection) -> dict[str, A
 
     Args:
         path: .db3, .mcap or .bag file, folder of a ROS 2 bag, or folder of bags.
-        topics: topics to read; if quantities repeat, the first counts. Without any, the only topic of joint states.
+        topics: topics to read; the first one with a quantity counts (default: the only topic of joint states).
         select: selects and renames joints.
 
     Raises:
@@ -74,7 +74,7 @@ def read(path: Path, *, topics: Sequence[str], select: Selection) -> dict[str, A
 
 
 def _paths(path: Path) -> list[Path]:
-    """The bags that a path names."""
+    """Returns the bags at a path."""
     if not path.is_dir() or (path / METADATA).is_file():
         return [path]
     inside = sorted(
@@ -88,7 +88,7 @@ def _paths(path: Path) -> list[Path]:
 
 
 def _read_one(path: Path, topics: Sequence[str], select: Selection) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Arrays of one bag, and remarks."""
+    """Reads the arrays of one bag, and remarks."""
     series: dict[Quantity, Series] = {}
     remarks: list[str] = []
     messages = _messages(path, topics)
@@ -121,7 +121,7 @@ def _read_one(path: Path, topics: Sequence[str], select: Selection) -> tuple[dic
 
 
 def _on_one_clock(series: dict[Quantity, Series], remarks: list[str]) -> tuple[np.ndarray, dict[Quantity, np.ndarray]]:
-    """Stamps of the slowest series and values of all series there, by the rules of the module; adds to the remarks.
+    """Returns the stamps of the slowest series and the values of all series at them; adds to the remarks.
 
     Raises:
         InputError: the series do not overlap in time.
@@ -160,7 +160,7 @@ def _on_one_clock(series: dict[Quantity, Series], remarks: list[str]) -> tuple[n
 
 
 def _series(topic: str, rows: Sequence[tuple[int, Any]], remarks: list[str]) -> dict[Quantity, Series]:
-    """Sorted series of a topic by field and joint, from (time of receipt in ns, message); adds to the remarks."""
+    """Sorts (time of receipt in ns, message) into series by field and joint; adds to the remarks."""
     columns: dict[Quantity, list[tuple[int, float]]] = {}
     for number, (_, message) in enumerate(rows):
         names = list(message.name)
@@ -196,12 +196,12 @@ def _series(topic: str, rows: Sequence[tuple[int, Any]], remarks: list[str]) -> 
 
 
 def _messages(path: Path, topics: Sequence[str]) -> dict[str, list[tuple[int, Any]]]:
-    """Messages with their times of receipt by topic, in the order of `topics`."""
+    """Reads messages and their times of receipt by topic, in the order of `topics`."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise InputError(f"reading ROS bags takes the package rosbags: {INSTALL}") from None
+        raise InputError(f"reading ROS bags needs the package rosbags: {INSTALL}") from None
     try:
         # Bags of older releases do not define their messages.
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
@@ -222,7 +222,7 @@ def _messages(path: Path, topics: Sequence[str]) -> dict[str, list[tuple[int, An
 
 
 def _wanted(topics: Sequence[str], everywhere: dict[str, str]) -> list[str]:
-    """The topics to read; error messages list the available ones."""
+    """Returns the topics to read; error messages list the available ones."""
     joint_states = [topic for topic, kind in everywhere.items() if kind == TYPE]
     listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(everywhere.items()))
     listed = f"the bag has {listed or 'no topics'}"

@@ -1,7 +1,7 @@
 """Detects the coordinate order of interacting bodies from the balance of their forces.
 
-Internal forces sum to zero along every axis, whatever the law (translation invariance, Newton's third law). Sums over
-the wrong columns mix axes and do not vanish, so an order that the file does not state can be inferred:
+Internal forces sum to zero along every axis for any law (translation invariance, Newton's third law). Sums over the
+wrong columns mix axes and do not vanish, which reveals an order that the file does not state:
 
     imbalance = rms over samples and axes of |sum_i F_i| / (sqrt(bodies) rms F)      0 if balanced, about 1 by chance
 """
@@ -30,7 +30,7 @@ class Bodies(NamedTuple):
 
 
 def imbalance(forces: JointSamples, bodies: Bodies) -> float:
-    """How far the forces are from summing to zero along every axis: 0 if balanced, about 1 by chance."""
+    """Returns the imbalance of the forces: 0 if they sum to zero along every axis, about 1 by chance."""
     size = np.sqrt(np.mean(forces**2))
     if not size > 0:
         return 0.0
@@ -43,14 +43,14 @@ def imbalance(forces: JointSamples, bodies: Bodies) -> float:
 
 
 def arrangements(d: int) -> list[Bodies]:
-    """All arrangements of d coordinates as at least two bodies in a plane or in space."""
+    """Lists all arrangements of d coordinates as two or more bodies in a plane or in space."""
     return [Bodies(axes, order) for axes in (2, 3) if d % axes == 0 and d >= 2 * axes for order in ORDERS]
 
 
 def find_bodies(forces: JointSamples, *, order: Order | None = None) -> Bodies | None:
-    """The only arrangement in which the forces on the bodies balance, or `None` unless there is exactly one.
+    """Returns the only arrangement with balanced forces on the bodies; `None` unless there is exactly one.
 
-    With a known `order` only the dimension is determined, as the one that balances best.
+    With a known `order`, returns the dimension with the best balance.
     """
     ways = [bodies for bodies in arrangements(forces.shape[1]) if order in (None, bodies.order)]
     ranked = sorted((imbalance(forces, bodies), bodies) for bodies in ways)

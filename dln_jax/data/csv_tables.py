@@ -2,9 +2,9 @@
 
     t [s],q1 [deg],q2 [deg],tau1 [N m],tau2 [N m]        or        t_s,q_elbow_rad,tau_elbow_Nm
 
-A title consists of a schema key, the joint (a number or a name; omitted for a single joint) and a unit, which is
-converted to SI. Units are never guessed: a title without one is refused unless the caller states `units`. Columns may
-come in any order. Other columns are named, but not read.
+A title consists of a schema key, the joint (a number or a name; omitted for a single joint) and a unit. Values are
+converted to SI. Units are never guessed: a title without a unit is refused unless the caller states `units`. Columns
+may come in any order. A remark names the columns that are not read.
 """
 
 import csv
@@ -24,9 +24,9 @@ from dln_jax.types import InputError, JointKind, JointSamples, SampleVector
 MOST_BYTES = 2**30
 """Largest file read; larger data are faster and smaller as npz."""
 STATED = {"si": {}, "degrees": {"q": "deg", "qd": "deg/s", "qdd": "deg/s2"}}
-"""Units that a caller may state for titles without one: by key, SI for all others."""
+"""Units by key that a caller may state for titles without a unit; other keys are in SI."""
 ALONE = ("t", "trajectory")
-"""Keys of one column, whatever the joints."""
+"""Keys with a single column for any number of joints."""
 DECIMALS = 10
 """Significant digits written, and decimals of rounded numbers."""
 TURN = math.pi / 180
@@ -58,10 +58,10 @@ _BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\])]*)[\])]\s*", re.DOTALL)
 
 
 def read(path: Path, *, units: str | None = None) -> dict[str, Any]:
-    """Reads a CSV file: the arrays by schema key, in SI units, and the titles of other columns under `UNREAD`.
+    """Reads a CSV file: arrays by schema key in SI units, and the titles of other columns under `UNREAD`.
 
     Args:
-        units: units of titles without one: "si", or "degrees" for angles in degrees and all else in SI.
+        units: units of titles without a unit: "si", or "degrees" for angles in degrees and the rest in SI.
 
     Raises:
         InputError: a missing header, a duplicate title, an unknown or missing unit, angles that look like radians
@@ -87,8 +87,8 @@ def read(path: Path, *, units: str | None = None) -> dict[str, Any]:
     bare = table[:, [place for place in positions if columns[place][2] is None]]
     if units == "degrees" and bare.size and (largest := float(np.abs(bare).max())) <= 2 * math.pi:
         raise InputError(
-            f"--units degrees: q goes to {largest:.3g} at most, as angles in radians do; give --units si, or write "
-            "[deg] into the titles if these are degrees"
+            f"--units degrees: q reaches only {largest:.3g}, which looks like radians; give --units si, or write [deg] "
+            "into the titles if these are degrees"
         )
     arrays: dict[str, Any] = {UNREAD: [title for place, title in enumerate(titles) if place not in columns]}
     for key, own in places.items():
@@ -101,7 +101,7 @@ def read(path: Path, *, units: str | None = None) -> dict[str, Any]:
 
 
 def _header(path: Path) -> list[str]:
-    """Titles of all columns, checked to be non-empty and unique."""
+    """Reads the titles of all columns; `InputError` for empty or repeated ones."""
     rows = _rows(path)
     titles = [title.strip() for title in next(rows, (0, []))[1]]
     if not titles:
@@ -121,7 +121,7 @@ def _header(path: Path) -> list[str]:
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Line number and cells of every row, without blank lines."""
+    """Yields the line number and cells of every row, without blank lines."""
     with path.open(encoding="utf-8-sig", newline="") as file:
         reader = csv.reader(file)
         try:
@@ -133,9 +133,9 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _key_joint_unit(title: str) -> tuple[str, str, str | None] | None:
-    """Parses a title; `None` if it names no key of the schema.
+    """Parses a title; `None` if it does not start with a schema key.
 
-    Returns the key, the number or name of the joint, empty if the title has none, and the unit as spelled in `UNITS`.
+    Returns the key, the number or name of the joint (empty for none), and the unit as spelled in `UNITS`.
     """
     match = _TITLE.fullmatch(title)
     if match is None:
@@ -162,7 +162,7 @@ def _key_joint_unit(title: str) -> tuple[str, str, str | None] | None:
 
 
 def _spelled(unit: str) -> str:
-    """Normalises a unit to its spelling in `UNITS`; a prefix mega, which none of them has, is spelled out."""
+    """Normalises a unit to its spelling in `UNITS`; mega, which is not in the table, is spelled out."""
     unit = re.sub(r"^\s*M(?=\s*[NnMmSs])", "mega", unit)
     unit = re.sub(r"[\s/]+per[\s/]+", "/", unit.lower())
     unit = re.sub(r"[\s*·.^]", "", unit)
@@ -172,7 +172,7 @@ def _spelled(unit: str) -> str:
 
 
 def _factor(title: str, key: str, unit: str | None, stated: str | None) -> float:
-    """Conversion factor of a column to SI."""
+    """Returns the conversion factor of a column to SI."""
     known = UNITS[key]
     if not known:
         return 1.0
@@ -185,12 +185,12 @@ def _factor(title: str, key: str, unit: str | None, stated: str | None) -> float
             )
         return known.get(STATED[stated].get(key, ""), 1.0)
     if unit not in known:
-        raise InputError(f"the unit of '{title:.60}' is not known; expected one of {', '.join(known)}")
+        raise InputError(f"'{title:.60}' has an unknown unit; expected one of {', '.join(known)}")
     return known[unit]
 
 
 def _by_key(titles: Sequence[str], columns: dict[int, tuple[str, str, str | None]]) -> dict[str, list[int]]:
-    """Column indices per key in the joint order of q: by number if all joints are numbers, else as in the file."""
+    """Returns the columns of each key in the joint order of q: by number, or as in the file for names."""
     keys: dict[str, dict[str, int]] = {}
     for place, (key, joint, _) in columns.items():
         own = keys.setdefault(key, {})
@@ -212,7 +212,7 @@ def _by_key(titles: Sequence[str], columns: dict[int, tuple[str, str, str | None
 
 
 def _numbers(path: Path, titles: Sequence[str], read_places: set[int]) -> np.ndarray:
-    """All rows below the header [N, columns], with zeros in columns that are not read."""
+    """Reads all rows below the header [N, columns], with zeros in skipped columns."""
     unread = set(range(len(titles))) - read_places
     converters: dict[int | str, Callable] = {**dict.fromkeys(unread, lambda _: 0.0)}
     header, _ = next(_rows(path))

@@ -53,7 +53,7 @@ class SampleSplit(NamedTuple):
 
 
 def load(path: str | Path) -> tuple[FunctionSamples, tuple[str, ...]]:
-    """Reads and checks a file, and names its keys that are not read; never unpickles.
+    """Reads and checks a file; also returns the keys that it skips. Never unpickles.
 
     Raises:
         InputError: the file is missing, is not an npz, holds pickled objects, or its arrays break the table above.
@@ -69,14 +69,16 @@ def from_arrays(arrays: dict[str, Any]) -> FunctionSamples:
             remedy = f"a single column is {key}[:, None]" if array.ndim == 1 else "one row per sample"
             raise InputError(f"{key} has shape {array.shape}; expected [N, {letter}] with {letter} >= 1: {remedy}")
     if len(x) != len(y):
-        raise InputError(f"y has {len(y)} samples, but x has {len(x)}; expected as many: keep one row per sample")
+        raise InputError(
+            f"y has {len(y)} samples, but x has {len(x)}; expected the same number: keep one row per sample"
+        )
     if len(x) < 2:
         raise InputError(f"x has {len(x)} sample(s); expected at least 2: add samples")
     return FunctionSamples(x, y, _derivative(arrays, "dy", x, y, 1), _derivative(arrays, "d2y", x, y, 2))
 
 
 def split(data: FunctionSamples, *, seed: int = 0) -> SampleSplit:
-    """Draws a tenth of independent samples for validation by the seed, and at least one.
+    """Draws a tenth of the samples, at least one, for validation.
 
     Raises:
         InputError: there are fewer than two samples.
@@ -113,11 +115,11 @@ PUBLISHED: dict[str, tuple[Any, int, int]] = {"sin": (sine, 1, 100), "cos_sin": 
 def published(
     name: str, *, samples: int = 25_600, noise: float = 1e-3, bound: float = np.pi, seed: int = 0
 ) -> FunctionSamples:
-    """Samples of a function of `PUBLISHED` at x uniform in [-bound, bound], with Gaussian noise on all arrays.
+    """Draws samples of a function of `PUBLISHED` at x uniform in [-bound, bound], with Gaussian noise on all arrays.
 
-    The published protocol has 25,600 samples, bound π, and noise of standard deviation 1e-3 on x, f and f'. The stored
-    x is the noisy one, so even the true function leaves residuals. The Hessian, which the published losses do not use,
-    has the same noise.
+    The published protocol has 25,600 samples, bound π, and noise with standard deviation 1e-3 on x, f and f'. The
+    stored x is the noisy one, so even the true function leaves residuals. The published losses do not use the Hessian;
+    it has the same noise.
 
     Raises:
         InputError: samples or bound are not positive, or the noise is negative.
@@ -135,7 +137,7 @@ def published(
 
 
 def published_grid(name: str, *, bound: float = np.pi) -> FunctionSamples:
-    """A function of `PUBLISHED` on an even grid over [-bound, bound], ends included; the first input is the slowest."""
+    """Evaluates a function of `PUBLISHED` on an even grid over [-bound, bound]; the first input is slowest."""
     exact, inputs, points = PUBLISHED[name]
     axes = [np.linspace(-bound, bound, points)] * inputs
     return exact(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, inputs))

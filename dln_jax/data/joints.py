@@ -1,7 +1,7 @@
-"""Joints as users state them: names, their match with the names of a robot, factors of torques, and `Needs` in JSON.
+"""Joints as users state them: names, their match with a robot's names, torque factors, and `Needs` in JSON.
 
-Names that differ from the robot's by one prefix or one ending are matched, such as `panda_joint1` and `fer_joint1`, or
-`elbow` and `elbow_joint`: replacing it must turn every name of the robot into one of the log, in exactly one way.
+Names match if they differ from the robot's by one prefix or one ending, such as `panda_joint1` and `fer_joint1`, or
+`elbow` and `elbow_joint`. Exactly one replacement must turn every robot name into a name of the log.
 """
 
 import json
@@ -21,15 +21,15 @@ PER_JOINT = ("q", *OPTIONAL, "temperature")
 
 
 TorqueFactor = float | int | Sequence[float | int] | Mapping[str, float | int]
-"""Factors of tau: one, one for each joint, or by name."""
+"""Factors of tau: one number, one per joint, or numbers by name."""
 
 
 def select_names(own: Sequence[str], stated: Sequence[str]) -> dict[str, str]:
-    """New names of the joints of a log that a user states, by their names in the log and in the stated order.
+    """Returns the joints that a user selects: names in the log -> new names, in the stated order.
 
     Args:
         own: names in the log.
-        stated: entries `LOG=NEW` rename a joint; if any entry is a name alone, only stated joints are kept, in order.
+        stated: `LOG=NEW` renames a joint; if any entry is a plain name, only the stated joints are kept, in order.
 
     Raises:
         InputError: an unknown name, an empty one, or two joints with one name.
@@ -38,7 +38,7 @@ def select_names(own: Sequence[str], stated: Sequence[str]) -> dict[str, str]:
     for entry in stated:
         old, renames, new = map(str.strip, entry.partition("="))
         if old not in own:
-            raise InputError(f"--joints: '{old:.60}' is not among the log's joints ({_listed(own)})")
+            raise InputError(f"--joints: '{old:.60}' is not a joint of the log ({_listed(own)})")
         if renames and not new:
             raise InputError(f"--joints: '{old:.60}=' lacks a name; expected LOG=NEW")
         renamed[old] = new or old
@@ -54,25 +54,27 @@ def with_selected_joints(arrays: dict[str, Any], joints: Sequence[str]) -> dict[
     """Selects, orders and renames the joints of a file's arrays as stated (see `select_names`).
 
     Raises:
-        InputError: joints are stated, but the file names none, or `select_names` refuses them.
+        InputError: joints are stated, but the file has no names, or `select_names` refuses them.
     """
     if not joints:
         return arrays
     names = np.asarray(arrays.get("joint_names", ()))
     if names.ndim != 1 or not names.size or names.dtype.kind not in "US":
-        raise InputError("--joints needs the joints' names, which the file lacks; add joint_names, or names in titles")
+        raise InputError("--joints needs joint names, but the file has none; add joint_names, or names in titles")
     own = names.tolist()
     selected = select_names(own, joints)
     places = [own.index(name) for name in selected]
     if "needs" in arrays and places != list(range(len(own))):
-        raise InputError("--joints selects or reorders joints, but the file has needs for its own; leave --joints out")
+        raise InputError(
+            "--joints selects or reorders joints, but the file states needs for all of them; leave --joints out"
+        )
     per_joint = [key for key in PER_JOINT if np.shape(arrays.get(key))[1:] == (len(own),)]
     columns = {key: np.asarray(arrays[key])[:, places] for key in per_joint}
     return {**arrays, **columns, "joint_names": np.array(list(selected.values()))}
 
 
 def match_names(own: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
-    """The name in the log of every joint of a robot: the same, or the same but for one prefix or ending.
+    """Matches the joints of a robot with names in the log, which may differ by one prefix or ending.
 
     Args:
         own: names in the log.
@@ -94,15 +96,15 @@ def match_names(own: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
         first, second = (", ".join(f"{b}={a}" for a, b in option.items()) for option in options[:2])
         raise InputError(f"the joints match the robot's in more than one way ({first:.150}; {second:.150}); {remedy}")
     missing = next(name for name in wanted if name not in own)
-    raise InputError(f"the robot's joint '{missing}' is not among the data's ({_listed(own)}); {remedy}")
+    raise InputError(f"the robot's joint '{missing}' is not in the data ({_listed(own)}); {remedy}")
 
 
 def _by_prefix(own: Sequence[str], wanted: Sequence[str]) -> list[dict[str, str]]:
-    """Different matches by the replacement of one prefix, which leaves at least one character of every name."""
+    """Returns the matches by replacing one prefix, which must leave at least one character of every name."""
     known, first = {name.casefold(): name for name in own}, wanted[0].casefold()
     options = []
     for name in known:
-        # The shortest replaced part, behind which the names agree.
+        # Shortest replaced part before the common ending.
         here = next((k for k in range(len(first)) if name.endswith(first[k:])), len(first))
         prefix, replaced = name.removesuffix(first[here:]), first[:here]
         if not all(other.casefold().startswith(replaced) and len(other) > here for other in wanted):
@@ -117,27 +119,29 @@ def scale_torques(arrays: dict[str, Any], stated: TorqueFactor | None) -> dict[s
     """Multiplies tau by one factor, one per joint, or factors by name (1 for other joints).
 
     Raises:
-        InputError: there is no tau, another number of factors than joints, an unknown name, or a factor of zero.
+        InputError: tau is missing, the number of factors differs from the joints, or a name or factor is invalid.
     """
     if stated is None:
         return arrays
     if np.ndim(arrays.get("tau")) != 2:
         why = "".join(f"; {remark}" for remark in arrays.get("remarks", ()))
-        raise InputError(f"--torque-factor scales tau, which the file lacks; leave it out{why}")
+        raise InputError(f"--torque-factor scales tau, but the file has no tau; leave it out{why}")
     count = np.shape(arrays["tau"])[1]
     names = np.asarray(arrays.get("joint_names", [str(joint + 1) for joint in range(count)])).astype(str).tolist()
     if isinstance(stated, Mapping):
         if unknown := [name for name in stated if name not in names]:
-            raise InputError(f"--torque-factor: '{unknown[0]:.60}' is not among the log's joints ({_listed(names)})")
+            raise InputError(f"--torque-factor: '{unknown[0]:.60}' is not a joint of the log ({_listed(names)})")
         factors = [stated.get(name, 1.0) for name in names]
     else:
         factors = [stated] * count if isinstance(stated, float | int) else stated
     if len(factors) != count:
-        raise InputError(f"--torque-factor has {len(factors)} numbers, the log {count} joints; give one, or all")
+        raise InputError(
+            f"--torque-factor has {len(factors)} numbers, but the log has {count} joints; give one, or all"
+        )
     if not all(factors):
         raise InputError("--torque-factor is zero; expected N m per unit of the log's efforts, negative to turn a sign")
     listed = ", ".join(f"{name} {factor:.4g}" for name, factor in zip(names, factors, strict=True))
-    remarks = (*arrays.get("remarks", ()), f"tau is that of the log times {listed}")
+    remarks = (*arrays.get("remarks", ()), f"tau of the log is multiplied by {listed}")
     return {**arrays, "tau": np.asarray(arrays["tau"]) * np.asarray(factors, float), "remarks": remarks}
 
 
@@ -147,7 +151,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def needs_from_text(text: str) -> Needs:
-    """`Needs` from JSON text; errors as for `needs_from_json`, also for text that is not JSON."""
+    """Reads `Needs` from JSON text; errors as for `needs_from_json`, also for text that is not JSON."""
     try:
         stated = json.loads(text, object_pairs_hook=_fields_once)
     except InputError:
@@ -159,7 +163,7 @@ def needs_from_text(text: str) -> Needs:
 
 
 def needs_from_json(stated: Any) -> Needs:
-    """`Needs` from parsed JSON.
+    """Converts parsed JSON to `Needs`.
 
     Raises:
         InputError: unknown or missing fields, or values of the wrong kind.

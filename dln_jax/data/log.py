@@ -1,4 +1,4 @@
-"""Reads a log and all that is known of it (joints, robot, filter, findings of the check), and splits it into parts."""
+"""Reads a log with its context (joints, robot, filter, findings of the check), and splits it into parts."""
 
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
@@ -32,16 +32,16 @@ from dln_jax.types import InputError, JointVector, Needs
 NO_GRAVITY = "no-gravity"
 """Check for torques from which a robot's controller has subtracted gravity."""
 NOISY = "raw-differences"
-"""Check for rates whose differences are dominated by the noise of q."""
+"""Check for rates that are dominated by the noise of q."""
 FILTERED = (
     "qd-sign", "qd-unlike", "qd-delay", "qd-exchanged", "qdd-unit", "qdd-sign", "qdd-unlike", "qdd-delay",
     "qdd-exchanged", NOISY, "quantisation", "jitter", "gaps", "rates", "repeated", "arrival",
 )  # fmt: skip
-"""Checks for faults that filtering q replaces or repairs."""
+"""Checks for faults that filtering q repairs."""
 SPLIT = ("split", "repeated-motions")
-"""Checks for faults that `split_log` settles."""
+"""Checks for faults that `split_log` resolves."""
 ASSUMED = "assumed: neither the file nor --needs says"
-"""Origin of needs that nobody states."""
+"""Origin of assumed needs."""
 USES = ("training", "validation", "the test")
 """Uses of the parts of a split, in their order."""
 HELD_OUT = slice(2, None, 5)
@@ -49,24 +49,24 @@ HELD_OUT = slice(2, None, 5)
 
 
 class Log(NamedTuple):
-    """Trajectories, and all that is known of them."""
+    """Trajectories with their context."""
 
     name: str
-    """Name of the data in messages: the file."""
+    """Name of the data in messages, usually the file."""
     data: Trajectories
     """The trajectories, filtered if `smoothed` is not `None`."""
     needs: Needs
     """Joints and terms of the plant."""
     needs_origin: str
-    """Who states them."""
+    """Source of the needs."""
     remarks: tuple[str, ...] = ()
-    """Lines on how the file was read, where rates come from, and what the check found."""
+    """Lines on how the file was read, the source of the rates, and the findings of the check."""
     faults: tuple[str, ...] = ()
-    """Faults that the check found and that no filter repairs."""
+    """Faults in the log that no filter repairs."""
     robot: Robot | None = None
-    """The robot that moved, without gravity if tau holds none."""
+    """The robot that moved; without gravity if tau does not include it."""
     smoothed: Smoothed | None = None
-    """The filter of q and its settings; `None` if the rates are the file's."""
+    """The filter of q and its settings; `None` if the rates come from the file."""
     measured: Trajectories | None = None
     """The trajectories before the filter."""
     plant: LagrangianSystem | None = None
@@ -75,13 +75,13 @@ class Log(NamedTuple):
     """q -> position [2] of the last body, m, for figures; `None` if unknown."""
 
     def __repr__(self) -> str:
-        """Name, size and plant in place of the arrays."""
+        """Shows name, size and plant instead of the arrays."""
         size = f"{len(self.data.t)} samples of {len(np.unique(self.data.trajectory))} trajectories"
         return f"Log of {self.name}: {size}\n  {'-'.join(self.needs.joints)} ({self.needs_origin})"
 
     @property
     def torque(self) -> str:
-        """The torque, measured or filtered, that models are fitted to and uncertainty bands refer to."""
+        """Describes the torque, measured or filtered, to which models and uncertainty bands refer."""
         if self.smoothed is None or not self.smoothed.filtered_torque:
             return "measured torques"
         return f"torques low-passed at {self.smoothed.cutoff:.3g} Hz (measured ones scatter more)"
@@ -105,21 +105,34 @@ def read_log(
 ) -> Log:
     """Reads, filters and checks a log: npz, CSV or a ROS bag.
 
-        log = read_log("mine.csv", robot="arm.urdf")
-
     Args:
-        path: the file, or a folder of a bag.
-        robot: the robot that moved, or its URDF or MJCF file; its joints are matched by name.
+        path: the file, or the folder of a bag.
+        robot: the robot that moved, or its URDF or MJCF file; joints are matched by name.
         rate: sampling rate of a file without t, Hz.
-        units: CSV: units of columns whose titles state none.
+        units: units of CSV columns without a unit in the title, "si" or "degrees".
         joints: joints to keep, in this order; "LOG=NAME" renames one.
-        topics: ROS bag: topics of joint states (default: the only one).
-        torque_factor: factor of tau, such as N m per A: one, one per joint, or by name.
-        known: needs, needs_origin, assume, driven, cutoff, decimate, settled and accept_log, as for `log_of`.
+        topics: topics of joint states in a ROS bag (default: the only one).
+        torque_factor: factor of tau, such as N m per A: one number, one per joint, or numbers by name.
+        known: needs, needs_origin, assume, driven, cutoff (Hz), decimate, settled and accept_log, as for `log_of`.
+
+    Returns:
+        The trajectories in SI units, with the needs of the plant, faults that the check reported, and remarks.
 
     Raises:
-        InputError: a file that is missing, damaged or of another schema; joints that are not the robot's; and as for
-            `log_of`.
+        InputError: the file is missing, damaged or breaks the schema, its joints are not the robot's, the check reports
+            an error and `accept_log` is false, or `log_of` refuses the data.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> import dln_jax
+        >>> t = np.linspace(0.0, 10.0, 201)
+        >>> rows = np.stack([t, np.sin(t), 9.81 * np.cos(np.sin(t)) - np.sin(t)], axis=1)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     np.savetxt(f"{folder}/log.csv", rows, delimiter=",", header="t [s],q [rad],tau [N m]", comments="")
+        ...     log = dln_jax.read_log(f"{folder}/log.csv")
+        >>> print(log.data.qdd.shape, log.needs.joints, log.faults)
+        (201, 1) ('revolute',) ()
     """
     if robot is not None and not isinstance(robot, Robot):
         robot = read_robot(Path(robot))
@@ -145,28 +158,28 @@ def log_of(
     accept_log: bool = False,
     more: str = "",
 ) -> Log:
-    """The log of trajectories in memory: their needs, rates of filtered q, and the findings of the check.
+    """Makes a log from trajectories in memory: completes the needs, filters q, derives rates and checks the data.
 
     Args:
         data: trajectories as read.
-        name: their name in messages.
+        name: name of the data in messages.
         robot: the robot that moved.
-        needs: joints and terms of the plant (default: those of the data, else of the robot, else revolute joints with
-            gravity; the last two with friction).
-        needs_origin: who states `needs`.
-        assume: trajectories -> needs that nobody states (default: revolute joints with gravity and friction).
-        driven: whether the motions need torques; without, they must have none, and rates are the command's concern.
-        cutoff: low-pass q at this frequency, Hz, and derive the rates; "auto" chooses it from the data, inf leaves q as
-            it is (default: the rates of the data; "auto" if one is missing and the noise of q matters).
+        needs: joints and terms of the plant (default: from the data, else from the robot with friction, else revolute
+            joints with gravity and friction).
+        needs_origin: source of `needs`, for messages.
+        assume: trajectories -> assumed needs (default: revolute joints with gravity and friction).
+        driven: whether torques drive the motions; free motions must have none, and keep their rates.
+        cutoff: cut-off of the low-pass on q, Hz, from which rates follow; "auto" chooses it from the data, inf does not
+            filter q (default: the rates of the data; "auto" if one is missing and q is noisy).
         decimate: with a cut-off, keep every n-th sample.
-        check: whether the data are a user's, which may have faults.
-        settled: names of checks that do not matter here.
-        accept_log: continue although the check found errors.
-        more: options of `check_data` beside the file, for messages.
+        check: run the checks for faults in users' data.
+        settled: names of checks to ignore.
+        accept_log: continue despite errors in the log.
+        more: further options of `check_data`, for messages.
 
     Raises:
-        InputError: needs, joints of the data and of the robot that contradict each other, no torques although
-            `driven` or torques although not, a cut-off that the data cannot be filtered at, or a log with an error.
+        InputError: needs, data and robot have different joints, torques are missing although `driven` or present
+            although not, the data do not suit the cut-off, or the log has an error.
     """
     if robot is not None and robot.tree.names:
         try:
@@ -176,11 +189,13 @@ def log_of(
     if driven and "tau" in data.estimated:
         remarks = f" ({'; '.join(data.remarks)})" if data.remarks else ""
         raise InputError(
-            f"{name}: there is no tau, which models of torques are fitted to; add the measured torques, or fit motions "
-            f"without applied forces by: python -m scripts.train_hnn_task --task measured --data {name}{remarks}"
+            f"{name}: column tau is missing, but torque models need it; add the measured torques, or fit motions "
+            f"without applied forces with dln-jax train_hnn_task --task measured --data {name}{remarks}"
         )
     if not driven and np.any(data.tau):
-        raise InputError(f"{name} has applied forces tau, unlike free motions; train it by train_hnn --data {name}")
+        raise InputError(
+            f"{name} has applied forces tau, but free motions have none; use dln-jax train_hnn --data {name}"
+        )
     origin = needs_origin
     if needs is None and data.needs is not None:
         needs, origin = data.needs, "the data file"
@@ -205,18 +220,18 @@ def log_of(
         try:
             smoothed = smooth(data, None if cutoff in (None, "auto") else cutoff, decimate=decimate)
         except InputError as error:
-            if cutoff is not None:  # otherwise the finding remains: the log is too short for a filter
+            if cutoff is not None:  # otherwise the log is too short for a filter and the finding remains
                 text = cutoff if isinstance(cutoff, str) else f"{cutoff:g}"
                 raise InputError(f"--cutoff {text}: {error}") from None
     ignored = {*settled, *(["friction"] if needs.friction or needs.joint_friction else [])}
     if smoothed is not None:
-        # Splines through q keep its noise.
+        # Splines without a filter keep the noise of q.
         ignored |= {check for check in FILTERED if check != NOISY or np.isfinite(smoothed.cutoff)}
     findings = [finding for finding in findings if finding.check not in ignored]
     remarks = list(preparation(data, smoothed) if driven else data.remarks)
     if cutoff is None and smoothed is not None:
-        remarks.insert(0, f"q is filtered before it is differentiated: {noisy[0]} (--cutoff inf leaves q as it is)")
-    remarks += lines_on(findings, name, accept_log, f"python -m scripts.check_data --data {name}{more}")
+        remarks.insert(0, f"q is filtered before differentiation: {noisy[0]} (--cutoff inf turns the filter off)")
+    remarks += lines_on(findings, name, accept_log, f"dln-jax check_data --data {name}{more}")
     if robot is not None and any(finding.check == NO_GRAVITY for finding in findings):
         robot = robot._replace(tree=robot.tree._replace(gravity=np.zeros(3)))
     faults = [finding for finding in findings if finding.severity != "note" and finding.check != NO_GRAVITY]
@@ -234,7 +249,7 @@ def log_of(
 
 
 def preparation(data: Trajectories, smoothed: Smoothed | None) -> list[str]:
-    """Lines that state how the file was read, where rates and torques come from, and how noisy they are."""
+    """Returns lines on how the file was read, and on the source and noise of rates and torques."""
     lines = list(data.remarks)
     if smoothed is None:
         if data.estimated:
@@ -243,32 +258,32 @@ def preparation(data: Trajectories, smoothed: Smoothed | None) -> list[str]:
     kept = f"{smoothed.rate / smoothed.decimate:.4g} Hz in {smoothed.parts} parts"
     how = "given" if smoothed.choice is None else "chosen from the spectra of q"
     lines.append(
-        f"rates: q is not filtered{', as its noise is too small' * (smoothed.choice is not None)}; splines, {kept}"
+        f"rates: q is not filtered{', its noise is small' * (smoothed.choice is not None)}; splines, {kept}"
         if np.isinf(smoothed.cutoff)
         else f"rates: q filtered without delay at {smoothed.cutoff:.3g} Hz ({how}), {kept}"
     )
-    torque = "filtered alike" if smoothed.filtered_torque else "not filtered"
+    torque = "filtered too" if smoothed.filtered_torque else "not filtered"
     sizes = [", ".join(f"{number:.2g}" for number in noise) for noise in (smoothed.noise_q, smoothed.noise_tau)]
     lines.append(f"noise of q {sizes[0]}; of tau {sizes[1]} ({torque})")
     if count := int((smoothed.repeats.q | smoothed.repeats.tau).sum()):
-        lines.append(f"{count} samples repeat the one before and are resampled over")
+        lines.append(f"{count} samples repeat the previous one and are interpolated")
     if smoothed.clock is not None:
         lines.append(f"{smoothed.clock.line}; their times replace t")
     if smoothed.left_out:
-        lines.append(f"{smoothed.left_out} segments are too short for the filter and left out")
+        lines.append(f"{smoothed.left_out} segments are too short for the filter and are left out")
     return lines
 
 
 def lines_on(findings: Sequence[Finding], name: str, accept_log: bool, check_data: str) -> list[str]:
-    """A line for each finding; `InputError` if one is an error, unless the log is accepted."""
+    """Returns a line for each finding; `InputError` for an error, unless the log is accepted."""
     if not findings:
         return []
     errors = [f"{finding.observation}; {finding.remedy}" for finding in findings if finding.severity == "error"]
     if errors and not accept_log:
-        raise InputError(f"{name}: {'; also '.join(errors)}; or go on with --accept-log ({check_data} says more)")
+        raise InputError(f"{name}: {'; also '.join(errors)}; or continue with --accept-log (details: {check_data})")
     lines = [f"warning: {error}" for error in errors]
     lines += [finding.line for finding in findings if finding.severity != "error"]
-    return [*lines, f"{check_data} says more"]
+    return [*lines, f"details: {check_data}"]
 
 
 class Parts(NamedTuple):
@@ -286,13 +301,13 @@ def split_log(log: Log, test: str | None = None, *, seed: int = 0, validation: b
     Args:
         log: the log.
         test: comma-separated labels of the test trajectories; "last:30%" for the end of every trajectory; or "blocks"
-            for ten blocks of time in each (default: every sixth trajectory, or the third of every five without
-            validation; or such blocks if there are too few trajectories).
-        seed: seed of the draw of the validation trajectories.
-        validation: whether a part is for model selection; otherwise it is empty.
+            for ten blocks of time in each (default: every sixth trajectory, or without validation the third of every
+            five; blocks if there are too few trajectories).
+        seed: seed for drawing the validation trajectories.
+        validation: hold out trajectories for model selection; otherwise that part is empty.
 
     Raises:
-        InputError: as for `data.splits.stated_test` and `data.splits.split`; or no trajectory to fit, or to test by.
+        InputError: as for `data.splits.stated_test` and `data.splits.split`; or the training or test set is empty.
     """
     data, labels = stated_test(log.data, test or None)
     recordings = len(np.unique(log.data.trajectory))

@@ -16,16 +16,15 @@ from dln_jax.types import InputError, require_positive
 
 KEYS = ("vertices", "elements", "held")
 Stored = tuple[Mesh, Int[np.ndarray, " k"] | None, tuple[str, ...]]
-"""A mesh, the indices of its fixed vertices (`None` if the file has none), and notes: what was left out, repaired or
-not read."""
+"""A mesh, the indices of its fixed vertices (`None` without any), and notes on skipped or repaired contents."""
 
 
 def load(path: str | Path, scale: float = 1.0) -> Stored:
     """Reads and checks a file; never unpickles. An npz file is never repaired.
 
     Args:
-        path: path of an npz file, or of a file that `read_mesh` reads.
-        scale: length of the file's unit in m, such as 0.001 for millimetres.
+        path: an npz file, or a file that `read_mesh` reads.
+        scale: unit of length of the file in m, such as 0.001 for millimetres.
 
     Raises:
         InputError: the file is missing, `read_mesh` refuses it, its arrays do not form a mesh, or `held` is malformed.

@@ -1,11 +1,11 @@
-"""Motions that several recordings show: a robot that runs one trajectory twenty times gives twenty similar recordings.
+"""Recognises recordings of the same motion, such as a robot running one trajectory twenty times.
 
-A model that was trained on some of them predicts the others about as well as the robot repeats itself, which says
-little about any other motion. Splits therefore keep recordings of one motion together.
+A model trained on some of them predicts the others about as well as the robot repeats itself, which says little about
+other motions. Splits therefore keep recordings of one motion together.
 
 Positions at `TIMES` times, a delay embedding (Takens 1981), describe where a robot is and how it moves, without the
-noise of measured velocities. A recording repeats another if nine tenths of its embedded positions lie near the
-other's, at whatever time: it may start later, or show a part of the motion.
+noise of measured velocities. A recording repeats another if nine tenths of its embedded positions lie near positions of
+the other at any time: it may start later, or show a part of the motion.
 """
 
 from collections.abc import Sequence
@@ -18,25 +18,24 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.types import JointSamples, SampleIndex
 
 TIMES, DURATION = 5, 0.3
-"""Number of embedded times, and the time that they span as a share of the shortest recording."""
+"""Number of embedded times, and their span as a fraction of the shortest recording."""
 CLOSE, SHARE = 0.1, 0.9
-"""Largest root mean square distance, in units of the positions' standard deviations, and the share of a recording that
-lies within it. A real arm of six joints repeated motions within 0.03 to 0.15; the nearest of twenty letters are 0.3
-apart."""
+"""Largest root mean square distance in standard deviations of the positions, and the fraction of a recording within it.
+A real arm of six joints repeated motions within 0.03 to 0.15; the nearest of twenty letters are 0.3 apart."""
 POINTS = 50
-"""Number of positions of a recording that are compared with the others."""
+"""Number of positions of a recording for the comparison."""
 MOVING = 1.0
-"""Recordings that move less than this multiple of `CLOSE` join a motion that passes their posture, but connect none."""
+"""Recordings that move less than this multiple of `CLOSE` can join a motion but cannot connect two."""
 SHORTEST, MOST = 50, 300
-"""Fewest samples of a recording that is compared, and the largest number of recordings."""
+"""Fewest samples of a recording for the comparison, and the largest number of recordings."""
 
 
 def motion_numbers(q: JointSamples, trajectory: SampleIndex) -> Int[np.ndarray, " T"]:
-    """Returns the number of the motion that each trajectory shows, by the trajectory's index.
+    """Returns the motion number of each trajectory, by the trajectory's index.
 
-    Motions are numbered by their first trajectories; absent trajectories have -1. Motionless and short trajectories,
-    very many, and those of one coordinate count as motions of their own: with a single coordinate, different motions
-    pass the same states.
+    The first trajectory of a motion gives its number; absent trajectories have -1. Motionless trajectories, short
+    trajectories, very many of them, and trajectories of one coordinate count as separate motions: with a single
+    coordinate, different motions pass the same states.
     """
     present = np.unique(trajectory)
     number = np.arange(present.max() + 1)
@@ -59,7 +58,7 @@ def motion_numbers(q: JointSamples, trajectory: SampleIndex) -> Int[np.ndarray, 
 def remark_on_repeats(
     trained: Sequence[Trajectories], test: Trajectories, motion: Int[np.ndarray, " T"] | None = None
 ) -> str:
-    """Returns a line on recordings of one motion: the test repeats trained ones, or `motion` kept them together."""
+    """Returns a line on repeated motions: the test repeats training motions, or `motion` kept them together."""
     sets = [*trained, test]
     q, trajectory = (np.concatenate([getattr(part, key) for part in sets]) for key in ("q", "trajectory"))
     seen, held = np.unique(np.concatenate([part.trajectory for part in trained])), np.unique(test.trajectory)
@@ -83,7 +82,7 @@ def remark_on_repeats(
 
 
 def _embedded(q: np.ndarray, trajectory: np.ndarray) -> dict[int, np.ndarray]:
-    """Returns the embedded positions of the trajectories that are compared, by index, in units of `CLOSE`."""
+    """Returns the embedded positions by trajectory index, in units of `CLOSE`."""
     spread = q.std(axis=0)
     if q.shape[1] < 2 or not spread.any():
         return {}

@@ -1,7 +1,8 @@
 """Writes robots: MJCF of any tree, and copies of URDF and MJCF files with identified inertias, armature and friction.
 
-Bodies fixed to a link move with it, and only the sum of their inertias is known. A copy has this sum in the link that
-the joint moves, and no inertias in the bodies fixed to it. Quantities that the format cannot store go into a comment.
+Bodies fixed to a link move with it, so only the sum of their inertias is known. A copy stores this sum in the link
+behind the joint and removes the inertias of bodies fixed to it. Quantities that the format cannot store go into a
+comment.
 """
 
 import copy
@@ -22,22 +23,22 @@ from dln_jax.types import InputError, require_positive
 
 LUMPS = "The inertia of all bodies that move with a joint is in the link behind it; links fixed to that link have none."
 Motor = tuple[np.ndarray, dict[str, float]]
-"""A motor that turns with several joints: its rate per joint rate, a row of S, and its constants by name."""
+"""A motor that turns with several joints: its row of S (motor rate per joint rate), and its constants by name."""
 COUPLED = "coupled_motor_"
-"""Start of the names of fixed tendons that stand for motors that turn with several joints."""
+"""Prefix of the fixed tendons that represent motors coupled to several joints."""
 
 
 def mjcf(robot: Robot, *, time_step: float = 0.001) -> str:
-    """MJCF text of a robot, with one body per link, one motor per joint and contacts disabled.
+    """Returns the MJCF text of a robot, with one body per link, one motor per joint and contacts disabled.
 
-    MuJoCo simulates it, and `read_robot` reads it back.
+    MuJoCo can simulate it, and `read_robot` reads it back.
 
     Args:
         robot: robot to write; infinite limits are left out.
         time_step: time step of the simulation, s.
 
     Raises:
-        InputError: a link has no mass, which MuJoCo refuses, or the time step is not positive.
+        InputError: a link has no mass, or the time step is not positive.
     """
     require_positive(time_step=time_step)
     tree = robot.tree
@@ -86,17 +87,18 @@ def write_robot(
 ) -> None:
     """Writes a copy of `original` with the inertias and friction of a tree, and its armature if the format has it.
 
-    An armature matrix, and friction of motors that turn with several joints, are fixed tendons in MJCF. URDF has no
-    place for them: a comment states them.
+    In MJCF, fixed tendons represent an armature matrix and the friction of motors coupled to several joints. URDF
+    cannot store them, so a comment states them.
 
     Args:
+        path: the new file.
         original: URDF or MJCF file with the tree's structure; it stays unchanged.
-        tree: tree with the joints of that file, by name.
-        damping: viscous friction of each joint (or motor) [d], N m s or N s/m; by default unchanged.
-        coulomb: dry friction [d], N m or N; by default unchanged.
-        motors: matrix S [d, d] of motor rates S qd; friction acts at the motors. By default each joint has its own.
-        lock: joints that were locked when the tree was read, as for `read_robot`. The bodies behind a locked joint
-            count towards the link before it, in the position in which the joint is locked.
+        tree: tree with the same joint names.
+        damping: viscous friction of each joint (or motor) [d], N m s or N s/m (default: unchanged).
+        coulomb: dry friction [d], N m or N (default: unchanged).
+        motors: matrix S [d, d] of motor rates S qd; friction acts at the motors (default: one motor per joint).
+        lock: joints that were locked when the tree was read, as for `read_robot`. Bodies behind a locked joint belong
+            to the link before it, at the locked position.
         remarks: lines of the comment at the top of the file.
 
     Raises:
@@ -105,7 +107,7 @@ def write_robot(
     """
     path, original = Path(path), Path(original)
     if path.exists() and original.exists() and path.samefile(original):
-        raise InputError(f"{path} is the original file, which stays unchanged; give another name")
+        raise InputError(f"{path} is the original file; choose another name")
     root = parse_robot(original)
     _, model, locked = compile_robot(original, copy.deepcopy(root), lock)
     names = [name for name in joint_names(model) if name not in locked]
@@ -134,7 +136,7 @@ def write_robot(
     else:
         if locked:
             raise InputError(
-                f"{original}: bodies behind the locked joints of an MJCF file would have no mass; remove these joints"
+                f"{original}: bodies behind locked joints of an MJCF file would have no mass; remove these joints"
             )
         _into_mjcf(original, root, model, tree, {"armature": armature, **losses})
         _tendons(root, names, coupled)
@@ -169,7 +171,7 @@ def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, constan
     for element in root.iter():
         if element.tag in ("include", "replicate", "attach", "composite", "flexcomp", "model"):
             raise InputError(
-                f"{original} has <{element.tag}>, with bodies that are elsewhere; expected one file, as MuJoCo saves it"
+                f"{original} has <{element.tag}> with bodies from elsewhere; expected a single file, as MuJoCo saves it"
             )
     for compiler in root.findall("compiler"):
         # These settings would alter the inertias written below.
@@ -192,7 +194,7 @@ def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, constan
 
 
 def _moving(model: Any, locked: Collection[str] = ()) -> list[int]:
-    """Bodies of a compiled model that move with a joint that is not locked."""
+    """Returns the bodies of a compiled model that move with an unlocked joint."""
     free = {model.jnt_bodyid[k] for k, name in enumerate(joint_names(model)) if name not in locked}
     moving: list[int] = []
     for body in range(1, model.nbody):  # parents come before their children
@@ -202,7 +204,7 @@ def _moving(model: Any, locked: Collection[str] = ()) -> list[int]:
 
 
 def _joints(element: ET.Element) -> Iterator[ET.Element]:
-    """The joints of an MJCF body, also those in its frames."""
+    """Yields the joints of an MJCF body, including its frames."""
     for part in element:
         if part.tag == "joint":
             yield part
@@ -211,13 +213,13 @@ def _joints(element: ET.Element) -> Iterator[ET.Element]:
 
 
 def _motors(tree: Tree) -> tuple[np.ndarray, list[Motor]]:
-    """Armatures of the joints, and the motors that turn with several joints."""
+    """Returns the armatures of the joints, and the motors coupled to several joints."""
     armature, coupled = single_motors(tree.armature)
     return armature, [(coefficients, {"armature": inertia}) for inertia, coefficients in coupled]
 
 
 def _split(motors: Any, losses: dict[str, Any]) -> tuple[dict[str, Any], list[Motor]]:
-    """Friction of joints with a motor of their own, and that of all other motors."""
+    """Separates the friction of joints with their own motor from the friction of coupled motors."""
     if motors is None:
         return losses, []
     S = np.asarray(motors, float)
@@ -231,7 +233,7 @@ def _split(motors: Any, losses: dict[str, Any]) -> tuple[dict[str, Any], list[Mo
 
 
 def _tendons(root: ET.Element, names: Sequence[str], motors: Sequence[Motor]) -> None:
-    """Replaces the fixed tendons of coupled motors, by name; others lose their armature, now part of the motors'."""
+    """Replaces the fixed tendons of coupled motors by name; other tendons lose their armature to the motors."""
     group = root.find("tendon")
     for tendons in root.findall("tendon"):
         for tendon in tendons.findall("fixed"):
@@ -254,12 +256,12 @@ def _mjcf_inertial(theta: np.ndarray) -> ET.Element:
 
 
 def _about_centre(theta: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass, centre of mass, and moments of inertia about it."""
+    """Returns the mass, the centre of mass, and the moments of inertia about it."""
     m, h, moments = parts(theta)
     centre = h / m
     return float(m), centre, moments - m * (centre @ centre * np.eye(3) - centre[:, None] * centre)
 
 
 def _text(numbers: Any) -> str:
-    """The shortest decimals that read back as the same numbers."""
+    """Formats numbers with the fewest digits that read back exactly."""
     return " ".join(map(repr, np.ravel(np.asarray(numbers, float)).tolist()))

@@ -1,8 +1,8 @@
 """Reads the XML of URDF and MJCF files: elements, the inertias of a URDF, and the limits of joints.
 
-Other formats, and files larger than any robot's, are refused. So are malformed limits: MuJoCo treats a range that is
-NaN, empty, swapped or half stated as no range, and a motion designed with it would drive the joint into its stop. The
-text of an MJCF file is read only for ranges of two zeros, which look like no range once compiled.
+Other formats, and implausibly large files, are refused. So are malformed limits: MuJoCo ignores a range that is NaN,
+empty, swapped or half stated, and a motion designed without it would drive the joint into its stop. The text of an MJCF
+file is read only for ranges of two zeros, which look like no range after compilation.
 """
 
 import os
@@ -33,14 +33,14 @@ NUMBERS = {"limit": ("velocity", "effort", *SIDES), "dynamics": ("damping", "fri
 """Numeric attributes of the child elements of a URDF joint; only those of `SIDES` may be negative."""
 MOMENTS = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
 PLACEHOLDER = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
-"""Inertia that MuJoCo accepts, for links whose stated one is read without it."""
+"""Valid inertia for MuJoCo; the stated inertia of a link is read from the XML."""
 REMEDY = "correct the file, or lock the joint"
 RANGES = {"range": ("position", "limited"), "actuatorfrcrange": ("torque", "actuatorfrclimited")}
-"""Attributes of an MJCF joint that hold two numbers: what they limit, and the attributes that disable them."""
+"""Attributes of an MJCF joint with two numbers -> the limited quantity, and the attribute that disables the limit."""
 
 
 class _Elements(ET.TreeBuilder):
-    """Builds elements, and refuses more than any robot has, since MuJoCo would compile such a file for minutes."""
+    """Builds elements, and refuses implausibly many, which MuJoCo would compile for minutes."""
 
     depth = count = 0
 
@@ -64,13 +64,13 @@ class _Elements(ET.TreeBuilder):
 
 
 def parse_robot(path: Path) -> ET.Element:
-    """The root element of a URDF or MJCF file, comments included; errors as for `read_robot`."""
+    """Parses a URDF or MJCF file to its root element, with comments; errors as for `read_robot`."""
     root = _root(path)
     if root.tag not in ("robot", "mujoco"):
         raise InputError(f"{path}: its outer element is <{root.tag}>; expected <robot> (URDF) or <mujoco> (MJCF)")
     for part in _with_included(path, root):
         _require_readable(path, part)
-    # Drake and Bullet know a link "world" that no file has to define; MuJoCo does not.
+    # In Drake and Bullet, a file need not define the link "world"; in MuJoCo it must.
     parents = {parent.get("link") for joint in root.findall("joint") for parent in joint.findall("parent")}
     if "world" in parents and all(link.get("name") != "world" for link in root.findall("link")):
         root.append(ET.Element("link", name="world"))
@@ -78,7 +78,7 @@ def parse_robot(path: Path) -> ET.Element:
 
 
 def _root(path: Path) -> ET.Element:
-    """The outer element of a file, whatever it is; raises `InputError`."""
+    """Parses a file to its outer element; `InputError` for unreadable files."""
     if not is_file(path):
         raise InputError(f"{path}: no such file; give the URDF or MJCF file of a robot")
     try:
@@ -89,7 +89,7 @@ def _root(path: Path) -> ET.Element:
             )
         content = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give a file that you may read") from None
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
     if b"<!ENTITY" in content.replace(b"\0", b""):  # in UTF-16 too
         raise InputError(f"{path}: it defines entities, which can grow without bound; expected plain XML")
     try:
@@ -101,7 +101,7 @@ def _root(path: Path) -> ET.Element:
 
 
 def link_inertias(root: ET.Element) -> dict[str, np.ndarray]:
-    """Inertial parameters [10] of every URDF link that states them, physically consistent or not, by name.
+    """Returns the inertial parameters [10] of URDF links by name, as stated, even if not physically consistent.
 
     Raises:
         InputError: an <inertial> is incomplete, not numeric or has a negative mass.
@@ -119,8 +119,8 @@ def link_inertias(root: ET.Element) -> dict[str, np.ndarray]:
         xyz, rpy = ([_number(text) for text in origin.get(key, "0 0 0").split()] for key in ("xyz", "rpy"))
         if not (len(xyz) == len(rpy) == 3 and m >= 0 and np.isfinite([m, *moments.ravel(), *xyz, *rpy]).all()):
             raise InputError(
-                f"link '{name}' has an <inertial> that is incomplete; expected a mass, not below zero, and six "
-                "moments, all finite numbers"
+                f"link '{name}' has an incomplete <inertial>; expected a mass of zero or more and six moments, all "
+                "finite numbers"
             )
         turn = Rotation.from_euler("xyz", rpy).as_matrix()  # about the fixed axes x, y, z, in this order
         theta = inertial_parameters(m, np.zeros(3), moments)
@@ -129,7 +129,7 @@ def link_inertias(root: ET.Element) -> dict[str, np.ndarray]:
 
 
 def without_shapes(root: ET.Element, *, inertias: bool) -> ET.Element:
-    """Prepares a URDF for MuJoCo: no shapes, every link a body of its own, and its inertias or ones MuJoCo accepts."""
+    """Prepares a URDF for MuJoCo: removes shapes, keeps every link as a body, and sets its or placeholder inertias."""
     for link in root.iter("link"):
         remove(link, "visual", "collision")
         if inertias:
@@ -188,9 +188,9 @@ def check_joints(path: Path, root: ET.Element, locked: Collection[str]) -> None:
 
 
 def velocity_limits(root: ET.Element) -> dict[str, float]:
-    """Velocity limits of a URDF by joint, rad/s or m/s, from <limit velocity="...">.
+    """Returns the velocity limits of a URDF by joint, rad/s or m/s, from <limit velocity="...">.
 
-    Joints without one are left out, as are limits of 0, which stand for an unknown limit in some files.
+    Joints without a limit are left out, and so are limits of 0, which mean an unknown limit in some files.
     """
     stated = {
         joint.get("name", ""): _attributes(joint, "limit").get("velocity", "0") for joint in root.findall("joint")
@@ -199,12 +199,12 @@ def velocity_limits(root: ET.Element) -> dict[str, float]:
 
 
 def driven_joints(root: ET.Element) -> list[str]:
-    """Names of the joints of a URDF that a <transmission> connects to a motor."""
+    """Returns the names of the URDF joints that a <transmission> connects to a motor."""
     return [joint.get("name", "") for motor in root.findall("transmission") for joint in motor.findall("joint")]
 
 
 def require_range(name: str, kind: str, stated: Sequence[str]) -> None:
-    """Raises `InputError` unless the limits of a named joint or actuator are two finite numbers, the lower first."""
+    """Raises `InputError` unless the limits of a joint or actuator are two finite numbers, the lower first."""
     numbers = np.array([_number(text) for text in stated])
     if not (numbers.shape == (2,) and np.isfinite(numbers).all() and numbers[0] < numbers[1]):
         shown = ", ".join(f"{text:.40}" if text else "nothing" for text in stated)
@@ -212,7 +212,7 @@ def require_range(name: str, kind: str, stated: Sequence[str]) -> None:
 
 
 def _number(text: str) -> float:
-    """The number; NaN for other text."""
+    """Converts text to a number; NaN for other text."""
     try:
         return float(text)
     except ValueError:
@@ -220,12 +220,12 @@ def _number(text: str) -> float:
 
 
 def _attributes(element: ET.Element, tag: str) -> dict[str, str]:
-    """Attributes of the first child with this tag; none without it."""
+    """Returns the attributes of the first child with this tag; empty without one."""
     return next((part.attrib for part in element.findall(tag)), {})
 
 
 def _with_included(path: Path, root: ET.Element, seen: Collection[Path] = ()) -> Iterator[ET.Element]:
-    """The outer element of an MJCF file and those of included or attached files; MuJoCo reports those not there."""
+    """Yields the outer elements of an MJCF file and of included or attached files; MuJoCo reports missing ones."""
     yield root
     seen = {*seen, path.resolve()}
     for part in (*root.iter("include"), *root.iter("model")):
@@ -235,7 +235,7 @@ def _with_included(path: Path, root: ET.Element, seen: Collection[Path] = ()) ->
 
 
 def _require_readable(path: Path, root: ET.Element) -> None:
-    """Raises `InputError` for a name of a pipe or device, which MuJoCo would wait for when it compiles the model."""
+    """Raises `InputError` for names of pipes or devices, on which MuJoCo would wait forever."""
     if root.tag == "robot":
         return
     compilers = list(root.iter("compiler"))
@@ -244,4 +244,4 @@ def _require_readable(path: Path, root: ET.Element) -> None:
         for folder in {"", *folders}:
             file = path.parent / folder / part.get("file", "")
             if os.path.exists(file) and not (is_file(file) or is_folder(file)):
-                raise InputError(f"{path}: <{part.tag}> names {file}, which is no regular file; expected one")
+                raise InputError(f"{path}: <{part.tag}> names {file}, which is not a regular file; give a regular file")

@@ -31,15 +31,15 @@ INSTALL = "pip install 'dln-jax[robot]'"
 Lock = Mapping[str, float] | Sequence[str]
 """Joints that do not move: names, or positions by name, rad or m."""
 KINDS = ("free", "a ball", "prismatic", "revolute")
-"""MuJoCo's kinds of joints, by their numbers."""
+"""MuJoCo's kinds of joints, in the order of their codes."""
 EQUAL_JOINTS, OVER_JOINT = 2, 1
-"""MuJoCo's numbers of equality constraints between joints, and of joints in fixed tendons."""
+"""MuJoCo's codes for equality constraints between joints, and for joints in fixed tendons."""
 LARGEST_NUMBER = 1e20
 """Largest admissible number, in SI units."""
 
 
 class Robot(NamedTuple):
-    """A tree and the other joint data of its file; limits that are not stated are infinite, friction zero."""
+    """A tree with the joint data of its file; missing limits are infinite, and missing friction is zero."""
 
     tree: Tree
     damping: JointVector
@@ -51,22 +51,38 @@ class Robot(NamedTuple):
     force_limits: Float[np.ndarray, "d 2"]
     """Limits of the motors, N m or N."""
     velocity_limits: Any = np.inf
-    """[d], 1/s or m/s, or one for all; stated in URDF only, since MJCF has no such limit."""
+    """[d] or one number for all, 1/s or m/s; from URDF only, since MJCF has no such limit."""
 
 
 def read_robot(path: str | Path, *, lock: Lock = ()) -> Robot:
-    """Reads a robot from a URDF or MJCF file.
+    """Reads a robot from a URDF or MJCF file, with the extra `[robot]` (MuJoCo).
 
     URDF inertias are read as stated, even if they are not physically consistent.
 
     Args:
-        lock: joints to lock, such as those of a gripper: names (locked at zero), or positions by name, rad or m.
+        path: the URDF or MJCF file.
+        lock: joints to lock, for example in a gripper: names (locked at zero), or positions by name, rad or m.
             "*finger*" matches all names that contain finger. Bodies behind a locked joint become fixed.
+
+    Returns:
+        The tree of d joints, and viscous and dry friction, limits of position, force and velocity, [d] in SI units.
 
     Raises:
         InputError: MuJoCo is missing; the file is missing, malformed or cyclic; a joint that is not locked is neither
             revolute, continuous nor prismatic, mimics another, has a spring, or has limits that are NaN, equal,
             swapped or half stated; a joint to lock does not exist; no joint moves; or a moving link has no mass.
+
+    Example:
+        >>> import pathlib
+        >>> import tempfile
+        >>> import dln_jax
+        >>> link = '<joint name="hinge" axis="0 1 0" damping="0.1"/><geom size="0.1" mass="2" pos="1 0 0"/>'
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = pathlib.Path(folder, "arm.xml")
+        ...     _ = file.write_text(f"<mujoco><worldbody><body>{link}</body></worldbody></mujoco>")
+        ...     robot = dln_jax.read_robot(file)
+        >>> print(robot.tree.names, robot.tree.joints, robot.damping)
+        ('hinge',) ('revolute',) [0.1]
     """
     path, root = Path(path), parse_robot(Path(path))
     try:
@@ -84,10 +100,10 @@ def read_robot(path: str | Path, *, lock: Lock = ()) -> Robot:
 def compile_robot(
     path: Path, root: ET.Element, lock: Lock, *, inertias: bool = False
 ) -> tuple[Any, Any, dict[str, float]]:
-    """MuJoCo, its model of the file with this root element, and the positions of locked joints by name.
+    """Compiles a file with MuJoCo; returns MuJoCo, its model, and the positions of locked joints by name.
 
-    For a URDF, shapes are left out, and inertias are placeholders unless they are asked for, as by a simulation: MuJoCo
-    refuses those that are not physically consistent. Errors as for `read_robot`.
+    Shapes of a URDF are left out. Its inertias are placeholders unless `inertias` is true (for simulations), because
+    MuJoCo refuses inertias that are not physically consistent. Errors as for `read_robot`.
     """
     refusal = f"{path}: MuJoCo cannot compile it"
     if root.tag == "mujoco":
@@ -102,8 +118,8 @@ def compile_robot(
         for mimic in joint.findall("mimic"):
             if joint.get("name") not in locked:
                 raise InputError(
-                    f"{path}: joint '{joint.get('name')}' follows another (mimic); expected joints that move freely: "
-                    "lock it, and the joint that it follows"
+                    f"{path}: joint '{joint.get('name')}' follows another joint (mimic); expected independent joints: "
+                    "lock both of them"
                 )
             joint.remove(mimic)
     source = ET.tostring(without_shapes(root, inertias=inertias), encoding="unicode")
@@ -111,14 +127,14 @@ def compile_robot(
 
 
 def joint_names(model: Any) -> list[str]:
-    """Names of MuJoCo's joints."""
+    """Returns the names of a compiled model's joints."""
     return [model.joint(k).name or f"joint_{k}" for k in range(model.njnt)]
 
 
 def require_ranges(model: Any, locked: Collection[str] = ()) -> None:
     """Raises `InputError` for limits of a compiled joint that are NaN, infinite, equal or swapped.
 
-    MuJoCo keeps the numbers of a range that it does not apply; zeros stand for no range.
+    MuJoCo keeps the numbers of a range that it does not apply; two zeros mean no range.
     """
     for k, name in enumerate(joint_names(model)):
         for kind, limits in (("position", model.jnt_range[k]), ("torque", model.jnt_actfrcrange[k])):
@@ -127,7 +143,7 @@ def require_ranges(model: Any, locked: Collection[str] = ()) -> None:
 
 
 def _matching(lock: Lock, names: Sequence[str]) -> dict[str, float]:
-    """Positions of the locked joints by full name."""
+    """Returns the positions of locked joints by full name."""
     positions = lock if isinstance(lock, Mapping) else dict.fromkeys(lock, 0.0)
     locked: dict[str, float] = {}
     for pattern, position in positions.items():
@@ -139,7 +155,7 @@ def _matching(lock: Lock, names: Sequence[str]) -> dict[str, float]:
 
 
 def compiled_model(source: Any, refusal: str = "MuJoCo refuses the model") -> tuple[Any, Any]:
-    """MuJoCo and its model of a file or of MJCF text; a `mujoco.MjModel` stays as it is.
+    """Returns MuJoCo and its model of a file or MJCF text; a `mujoco.MjModel` is returned unchanged.
 
     Raises:
         InputError: MuJoCo is missing, or cannot compile the source; the message begins with the refusal.
@@ -147,7 +163,7 @@ def compiled_model(source: Any, refusal: str = "MuJoCo refuses the model") -> tu
     try:
         mujoco: Any = importlib.import_module("mujoco")
     except ImportError:
-        raise InputError(f"MuJoCo, which reads and simulates robots, is not installed; {INSTALL}") from None
+        raise InputError(f"reading and simulating robots needs MuJoCo, which is not installed; {INSTALL}") from None
     if not isinstance(source, (str, Path)):
         return mujoco, source
     make = mujoco.MjModel.from_xml_string if isinstance(source, str) else mujoco.MjModel.from_xml_path
@@ -160,7 +176,7 @@ def compiled_model(source: Any, refusal: str = "MuJoCo refuses the model") -> tu
 
 @contextlib.contextmanager
 def quiet(mujoco: Any) -> Iterator[None]:
-    """Keeps MuJoCo from writing MUJOCO_LOG.TXT into the working folder; its data still count warnings."""
+    """Keeps MuJoCo from writing MUJOCO_LOG.TXT into the working folder; its data still counts warnings."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)
     try:
@@ -170,7 +186,7 @@ def quiet(mujoco: Any) -> Iterator[None]:
 
 
 def _require_tree(model: Any, names: list[str], locked: Collection[str]) -> None:
-    """Raises `InputError` unless every joint that is not locked moves freely about or along one axis."""
+    """Raises `InputError` unless every unlocked joint moves freely about or along one axis."""
     for name, kind in zip(names, model.jnt_type, strict=True):
         if KINDS[kind] in ("free", "a ball") and name not in locked:
             raise InputError(
@@ -179,22 +195,22 @@ def _require_tree(model: Any, names: list[str], locked: Collection[str]) -> None
     moving = {k for k, name in enumerate(names) if name not in locked}
     for k in moving & set(np.flatnonzero(model.jnt_stiffness)):
         raise InputError(
-            f"joint '{names[k]}' has a spring (stiffness {model.jnt_stiffness[k]:.4g}), which no tree of rigid bodies "
-            "has; remove the stiffness, or lock the joint"
+            f"joint '{names[k]}' has a spring (stiffness {model.jnt_stiffness[k]:.4g}), but rigid trees have none; "
+            "remove the stiffness, or lock the joint"
         )
     # Equality constraints and tendons between locked joints have no effect; tendons without a spring are motors.
     springs = np.repeat((model.tendon_stiffness != 0) | np.asarray(model.tendon_limited, bool), model.tendon_num)
     tied = {int(k) for numbers in (model.eq_obj1id, model.eq_obj2id, model.wrap_objid[springs]) for k in numbers}
     if (model.eq_type != EQUAL_JOINTS).any() or (model.wrap_type != OVER_JOINT).any() or tied & moving:
         raise InputError(
-            "it has equality constraints or tendons, which close loops; expected a tree: lock the joints that they tie"
+            "it has equality constraints or tendons, which close loops; expected a tree: lock the joints they connect"
         )
     if not 0 < len(moving) <= MOST_JOINTS:
         raise InputError(f"it has {len(moving)} joints; expected 1 to {MOST_JOINTS} that move")
 
 
 def robot_of(model: Any, locked: Mapping[str, float], stated: Mapping[str, np.ndarray] | None = None) -> Robot:
-    """The robot of a compiled model, with the inertias that a URDF states in place of the model's.
+    """Converts a compiled model to a robot; `stated` inertias of a URDF replace the model's.
 
     Errors as for `read_robot`.
     """
@@ -261,7 +277,7 @@ def robot_of(model: Any, locked: Mapping[str, float], stated: Mapping[str, np.nd
 
 
 def _armature(model: Any, moving: list[int]) -> np.ndarray:
-    """Armature of the moving joints: [d], or [d, d] if fixed tendons have an armature."""
+    """Returns the armature of the moving joints: [d], or [d, d] if fixed tendons have an armature."""
     armature = np.asarray(model.dof_armature[model.jnt_dofadr[moving]], float)
     for tendon in np.flatnonzero(model.tendon_armature):
         wraps = model.tendon_adr[tendon] + np.arange(model.tendon_num[tendon])
@@ -274,7 +290,7 @@ def _armature(model: Any, moving: list[int]) -> np.ndarray:
 
 
 def _require_numbers(robot: Robot) -> None:
-    """Raises `InputError` for numbers out of the range of real robots."""
+    """Raises `InputError` for numbers that no real robot has."""
     tree = robot.tree
     armature = tree.armature if np.ndim(tree.armature) == 1 else np.diagonal(tree.armature)
     losses = {"damping": robot.damping, "dry friction": robot.coulomb, "armature": armature}

@@ -1,4 +1,4 @@
-"""Schema of trajectory files (npz, CSV, ROS bags): how they are read, checked and written.
+"""Reads, checks and writes trajectory files (npz, CSV, ROS bags).
 
 Samples of all trajectories are concatenated on axis 0.
 
@@ -40,13 +40,13 @@ from dln_jax.types import InputError, Needs, require_positive
 
 KEYS = ("t", *PER_JOINT, "trajectory", "label", "joint_names", "needs")
 RATES = {"qd": "q", "qdd": "qd"}
-"""Rates, and what they are derivatives of."""
+"""Rates -> the quantities that they differentiate."""
 ABSOLUTE_ZERO = -273.15
 """°C."""
 LARGEST_INDEX = 2**53
-"""float64 is exact for integers up to this one."""
+"""float64 represents integers up to this one exactly."""
 LONG = np.pi / 4
-"""rad: usual steps of angles are shorter."""
+"""rad: longer than usual steps of an angle."""
 
 
 class Trajectories(NamedTuple):
@@ -71,7 +71,7 @@ class Trajectories(NamedTuple):
     estimated: tuple[str, ...] = ()
     """Keys that were absent: rates estimated by finite differences, torques set to zero."""
     remarks: tuple[str, ...] = ()
-    """How the file was read: columns and joints left out or matched, repaired stamps, and the clock of a bag."""
+    """Lines on how the file was read: skipped or matched columns and joints, repaired stamps, the clock of a bag."""
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -79,7 +79,7 @@ class Trajectories(NamedTuple):
         return self.q.shape[1]
 
     def __repr__(self) -> str:
-        """Sizes and keys in place of the arrays."""
+        """Shows sizes and keys instead of the arrays."""
         keys = [key for key in PER_JOINT if getattr(self, key) is not None]
         size = f"{len(self.t)} samples of {len(np.unique(self.trajectory))} trajectories, d = {self.degrees_of_freedom}"
         return f"Trajectories: {size}\n  {', '.join(keys)}; estimated: {', '.join(self.estimated) or 'none'}"
@@ -96,7 +96,7 @@ def load(
     robot: Sequence[str] = (),
     repair: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
 ) -> Trajectories:
-    """Reads and checks an npz file, a CSV file or a ROS bag; never unpickles.
+    """Reads and checks trajectories from an npz file, a CSV file or a ROS bag; never unpickles.
 
     Args:
         path: .csv for CSV (see `data.csv_tables`); .db3, .mcap, .bag or a folder for a bag (see `data.bags`).
@@ -105,11 +105,26 @@ def load(
         joints: names of joints to keep, in this order, or LOG=NEW to rename one (see `data.joints.select_names`).
         topics: topics of joint states in a bag; by default the only one.
         torque_factor: factor of tau, N m per A for currents: one number, one for each joint, or numbers by name.
-        robot: names of the robot's joints; of a bag only those are read (`splits.with_joints` orders them).
+        robot: names of the robot's joints; a bag is read for these only (`splits.with_joints` orders them).
         repair: changes the arrays of the file before they are checked.
+
+    Returns:
+        Arrays of all samples in SI units; `data.schema` has their keys and shapes. Missing qd and qdd are estimated by
+        finite differences, a missing tau is zero, and `estimated` lists both.
 
     Raises:
         InputError: the file is missing, damaged or pickled, breaks the schema, or lacks a stated joint or topic.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> import dln_jax
+        >>> t = np.linspace(0.0, 2.0, 101)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     np.savez(f"{folder}/log.npz", t=t, q=np.sin(t)[:, None], tau=np.cos(t)[:, None])
+        ...     data = dln_jax.load_trajectories(f"{folder}/log.npz")
+        >>> print(data.q.shape, data.qd.shape, data.estimated)
+        (101, 1) (101, 1) ('qd', 'qdd')
     """
     suffix = Path(path).suffix.lower()
     of_bag = is_folder(Path(path)) or suffix in bags.SUFFIXES
@@ -135,10 +150,10 @@ def load(
 
 
 def _with_times(arrays: dict[str, Any], rate: float | int | None) -> dict[str, Any]:
-    """Completes the arrays with t, from the rate, and with trajectory, as one recording, if they are absent.
+    """Adds missing arrays: t from the rate, and trajectory for a single recording.
 
     Raises:
-        InputError: there is neither t nor a rate, there are both, or the rate is not positive.
+        InputError: neither or both of t and the rate are given, or the rate is not positive.
     """
     if "q" not in arrays:
         return arrays  # `from_arrays` refuses them
@@ -156,10 +171,10 @@ def _with_times(arrays: dict[str, Any], rate: float | int | None) -> dict[str, A
 
 
 def column(data: Trajectories, key: str) -> np.ndarray:
-    """One of the optional arrays; raises `InputError` if it is absent."""
+    """Returns an optional array; `InputError` if it is absent."""
     array = getattr(data, key)
     if array is None:
-        raise InputError(f"the data have no {key}, which is needed here; add it")
+        raise InputError(f"the data have no {key}, but it is needed here; add it")
     return array
 
 
@@ -209,9 +224,9 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
 
 
 def _named_trajectories(arrays: dict[str, Any], t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Index of every sample's trajectory and the trajectories' names; raises `InputError` for invalid ones.
+    """Returns the trajectory index of every sample, and the trajectories' names; `InputError` for invalid ones.
 
-    The samples of each trajectory must be together and in the order of time.
+    The samples of each trajectory must be contiguous and in the order of time.
     """
     trajectory = numeric(arrays, "trajectory", t.shape, most=np.inf)
     if (trajectory != np.round(trajectory)).any() or trajectory.min() < 0 or trajectory.max() > LARGEST_INDEX:
@@ -233,7 +248,7 @@ def _named_trajectories(arrays: dict[str, Any], t: np.ndarray) -> tuple[np.ndarr
             stated = f"names {len(label)} trajectories, but trajectory counts {count}"
             raise InputError(f"label {stated}; add the missing names")
         if len(set(label)) < len(label):
-            raise InputError("label has repeated names; give every trajectory a name of its own")
+            raise InputError("label has repeated names; give every trajectory its own name")
         label = label.astype(str)
     same = trajectory[1:] == trajectory[:-1]
     starts = trajectory[np.flatnonzero(np.r_[True, ~same])]
@@ -242,20 +257,21 @@ def _named_trajectories(arrays: dict[str, Any], t: np.ndarray) -> tuple[np.ndarr
     for sample in 1 + np.flatnonzero(same & (np.diff(t) <= 0))[:1]:
         raise InputError(
             f"t does not increase at sample {sample} of trajectory '{label[trajectory[sample]]}'; sort the samples by "
-            "time, and number recordings that follow one another in a column 'trajectory'"
+            "time, and number consecutive recordings in a column 'trajectory'"
         )
     return trajectory, label
 
 
 def _unwrap(q: np.ndarray, trajectory: np.ndarray, revolute: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """Angles without the jumps by 2 pi of sensors that wrap, and remarks on them.
+    """Removes jumps by 2 pi from angles of sensors that wrap; also returns remarks.
 
-    A joint is left alone if a step beside its jumps, or more than one in a hundred, is long: turns could be motions.
+    A joint stays unchanged if one of its unwrapped jumps, or more than one in a hundred of its steps, is long: its
+    jumps could be motions.
 
     Args:
         q: [N, d].
-        trajectory: index of every sample's trajectory [N].
-        revolute: joints that turn [d].
+        trajectory: trajectory index of every sample [N].
+        revolute: mask of revolute joints [d].
     """
     ends = np.flatnonzero(np.diff(trajectory)) + 1
     straight = np.concatenate([np.unwrap(part, axis=0) for part in np.split(q, ends)])
@@ -269,12 +285,12 @@ def _unwrap(q: np.ndarray, trajectory: np.ndarray, revolute: np.ndarray) -> tupl
 
 
 def time_derivative(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, *, name: str) -> np.ndarray:
-    """Second-order finite differences of values [N, d] over t [N], trajectory by trajectory.
+    """Differentiates values [N, d] over t [N] by second-order finite differences, for each trajectory.
 
-    Central inside, one-sided at the ends, any spacing; differences never reach across trajectories.
+    Differences are central inside and one-sided at the ends, at any spacing.
 
     Raises:
-        InputError: a trajectory has fewer than three samples; the message names `name`, the key to be estimated.
+        InputError: a trajectory has fewer than three samples; the message contains `name`, the estimated key.
     """
     result = np.empty_like(values)
     for index in np.unique(trajectory):
@@ -282,7 +298,7 @@ def time_derivative(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, *
         count = int(samples.sum())
         if count < 3:
             raise InputError(
-                f"{name} is missing, and trajectory {index} has {count} sample(s): estimating it takes at least 3; "
+                f"{name} is missing, and trajectory {index} has {count} sample(s) but its estimate needs at least 3; "
                 f"add {name} or record longer trajectories"
             )
         result[samples] = np.gradient(values[samples], t[samples], axis=0, edge_order=2)
@@ -290,19 +306,36 @@ def time_derivative(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, *
 
 
 def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> None:
-    """Writes a file that `load` reads; estimated keys are left out, so the file holds only measured data.
+    """Writes trajectories to an npz file that `load_trajectories` reads, without estimated arrays.
+
+    Args:
+        path: file name, which ends in .npz.
+        data: trajectories in SI units.
+        overwrite: replace an existing file.
 
     Raises:
         InputError: the name does not end in .npz, the file exists and `overwrite` is false, its folder does not exist,
-            or the data break the schema.
+            or the data break the schema. Nothing is written then.
+
+    Example:
+        >>> import tempfile
+        >>> import dln_jax
+        >>> from dln_jax.scenes.datasets.generators import uniform
+        >>> from dln_jax.scenes.pendulums import pendulum
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     dln_jax.save_trajectories(f"{folder}/swings.npz", uniform(pendulum(), samples=50))
+        ...     print(dln_jax.load_trajectories(f"{folder}/swings.npz").tau.shape)
+        (50, 1)
     """
     path = Path(path)
     if path.suffix != ".npz":
-        raise InputError(f"{path}: trajectories are stored as npz; let the name end in .npz")
+        raise InputError(f"{path}: trajectories are stored as npz; choose a name that ends in .npz")
     if (path.exists() or path.is_symlink()) and not (overwrite and is_file(path)):
-        raise InputError(f"{path} exists; choose another name or ask to overwrite it")
+        raise InputError(f"{path} exists; choose another name or pass overwrite=True")
     if not isinstance(data, Trajectories):
-        raise InputError(f"data is a {type(data).__name__}; expected Trajectories, such as `load_trajectories` gives")
+        raise InputError(
+            f"data is a {type(data).__name__}; expected Trajectories, for example from `load_trajectories`"
+        )
     arrays: dict[str, Any] = {
         key: value
         for key, value in data._asdict().items()

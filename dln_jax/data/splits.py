@@ -16,7 +16,7 @@ from dln_jax.types import InputError, SampleIndex, SampleVector, require_positiv
 
 PER_SAMPLE = ("t", "trajectory", *PER_JOINT)
 LEAST_TRAJECTORIES = 3
-"""Fewest trajectories for a split: one each for training, validation and test."""
+"""Fewest trajectories for a split: one for each of training, validation and test."""
 BLOCKS = 10
 """Number of time blocks per trajectory if there are too few trajectories."""
 GAP = 1.5
@@ -50,12 +50,12 @@ def every(data: Trajectories, step: int) -> Trajectories:
 
 
 def with_joints(data: Trajectories, names: Sequence[str]) -> Trajectories:
-    """Selects, orders and renames the columns of the data as these joints; data without joint names stay unchanged.
+    """Selects, orders and renames the columns of the data for these joints; data without names stay unchanged.
 
-    Remarks say which names were matched (see `data.joint_names`), and how far joints moved that are left out.
+    Remarks list the matched names (see `data.joints`), and the motion of joints that are left out.
 
     Raises:
-        InputError: the names do not match; or there are none, and the number of joints differs.
+        InputError: the names do not match, or data without names have another number of joints.
     """
     d = data.degrees_of_freedom
     if d < len(names) or (data.joint_names is None and d != len(names)):
@@ -77,7 +77,7 @@ def with_joints(data: Trajectories, names: Sequence[str]) -> Trajectories:
 
 
 def segments(t: SampleVector, trajectory: SampleIndex, *, gap: float = GAP) -> list[Int[np.ndarray, " n"]]:
-    """Sample indices of the segments of all trajectories, cut at steps longer than `gap` times the median step.
+    """Returns the sample indices of all segments; a step longer than `gap` times the median step ends a segment.
 
     Raises:
         InputError: `gap` is not above 1, or no trajectory has two samples.
@@ -95,12 +95,12 @@ def segments(t: SampleVector, trajectory: SampleIndex, *, gap: float = GAP) -> l
 
 
 def window_indices(data: Trajectories, length: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sample indices [W, T] of consecutive windows, which share their end samples, and the weights of the samples.
+    """Returns the sample indices [W, T] of consecutive windows, which share their end samples, and sample weights.
 
     Windows lie within segments. The rest of a segment is a shorter window, padded with its last sample at weight 0.
 
     Raises:
-        InputError: a length below 2, or no two samples without a gap between them.
+        InputError: a length below 2, or gaps between all samples.
     """
     if length < 2:
         raise InputError(f"length is {length}; expected a window of at least 2 samples")
@@ -116,7 +116,7 @@ def window_indices(data: Trajectories, length: int) -> tuple[np.ndarray, np.ndar
 
 
 def drawn(data: Trajectories, most: int, seed: int) -> Trajectories:
-    """At most `most` samples, drawn by the seed and kept in their order; `InputError` if either is out of range."""
+    """Draws at most `most` samples and keeps their order; `InputError` for a number or seed out of range."""
     require_positive(samples=most)
     require_seed(seed)
     count = len(data.t)
@@ -127,10 +127,10 @@ def drawn(data: Trajectories, most: int, seed: int) -> Trajectories:
 
 
 def in_blocks(data: Trajectories, blocks: int, *, last: float = 0.0) -> Trajectories:
-    """Cuts every trajectory into blocks of time that become trajectories of their own: "LABEL[0]" and so on.
+    """Cuts every trajectory into blocks of time, as trajectories "LABEL[0]" and so on.
 
-    With `last`, its last share becomes "LABEL[last]", and a single block before it "LABEL[first]". Estimated rates stay
-    unchanged. Neighbouring blocks are nearly identical at their common end.
+    The last fraction `last` of a trajectory becomes "LABEL[last]", and a single block before it "LABEL[first]".
+    Estimated rates stay unchanged. Neighbouring blocks are nearly identical at their common end.
 
     Raises:
         InputError: a trajectory has too few samples.
@@ -152,10 +152,10 @@ def in_blocks(data: Trajectories, blocks: int, *, last: float = 0.0) -> Trajecto
 
 
 def label_indices(data: Trajectories, labels: Sequence[str]) -> np.ndarray:
-    """Indices of the trajectories with these labels.
+    """Returns the indices of the trajectories with these labels.
 
     Raises:
-        InputError: a label that the data do not have.
+        InputError: an unknown label.
     """
     known = list(data.label)
     unknown = [label for label in labels if label not in known]
@@ -176,18 +176,17 @@ def split(
 ) -> Split:
     """Splits trajectories into test, validation and training sets.
 
-    The validation trajectories (at least one) are drawn by the seed from those that are not for the test, so model
-    selection never sees the test.
+    The validation trajectories, at least one, are drawn from those outside the test set, so model selection never sees
+    the test.
 
     Args:
         data: trajectories.
-        test: labels of the test trajectories (default: those of the chosen motions).
-        validation_share: share of the other trajectories that is for validation; zero for none.
+        test: labels of the test trajectories (default: the trajectories of the chosen motions).
+        validation_share: fraction of the other trajectories for validation; zero for none.
         seed: seed of the draw.
-        motion: number of the motion that each trajectory shows, as from `repeated_motions.motion_numbers`:
-            trajectories of one motion stay together, if there are enough motions. By default every trajectory shows
-            its own.
-        chosen: motions that are the test without labels.
+        motion: motion number of each trajectory, from `repeated_motions.motion_numbers`. Trajectories of one motion
+            stay together if there are enough motions (default: each trajectory is its own motion).
+        chosen: test motions if there are no labels.
 
     Raises:
         InputError: a label is unknown or has no samples, too few trajectories remain for training and validation, a
@@ -204,7 +203,7 @@ def split(
     if len(rest) < least - 1 or not len(held):
         raise InputError(
             f"{len(present)} trajectories, {len(held)} of them for the test, leave {len(rest)} for training{uses}; "
-            f"at least {least} in all are needed: record more, test by fewer, or cut long ones and index the parts"
+            f"at least {least} in all are needed: record more, test on fewer, or cut long ones and index the parts"
         )
     train, validation = select(data, rest), select(data, [])
     require_no_copies(train, select(data, held))
@@ -220,10 +219,10 @@ def by_motion(
     *,
     least: int,
 ) -> Int[np.ndarray, " h"]:
-    """Returns the trajectories of the chosen motions, or of the last one if the choice is empty.
+    """Returns the trajectories of the chosen motions, or of the last motion if the choice is empty.
 
-    If motions are repeated, a choice of more than half of the trajectories is replaced by the motion with the fewest.
-    If there are fewer than `least` motions, every trajectory counts as one.
+    If motions repeat and the choice covers more than half of the trajectories, the motion with the fewest trajectories
+    replaces it. With fewer than `least` motions, every trajectory counts as a motion.
     """
     of = _shown(present, motion, least)
     every, counts = np.unique(of, return_counts=True)
@@ -234,14 +233,14 @@ def by_motion(
 
 
 def _shown(present: np.ndarray, motion: np.ndarray | None, least: int) -> np.ndarray:
-    """Returns the motion of each trajectory, or the trajectories themselves if there are fewer than `least` motions."""
+    """Returns the motion of each trajectory; with fewer than `least` motions, the trajectories themselves."""
     return present if motion is None or len(np.unique(motion[present])) < least else motion[present]
 
 
 def hold_out(
     data: Trajectories, share: float, seed: int, motion: Int[np.ndarray, " T"] | None = None
 ) -> tuple[Trajectories, Trajectories]:
-    """Training and validation trajectories, at least one of each, drawn by the seed; `motion` as for `split`.
+    """Draws training and validation trajectories, at least one of each; `motion` as for `split`.
 
     Raises:
         InputError: fewer than two trajectories, a share outside (0, 1), or a seed out of range.
@@ -256,20 +255,20 @@ def hold_out(
 
 
 def held_out(count: int, share: float, what: str) -> int:
-    """Number of items held out for validation; at least one is held out and one left for training.
+    """Returns the number of items for validation; at least one is held out, and one remains for training.
 
     Raises:
         InputError: fewer than two items, or a share outside (0, 1).
     """
     if count < 2:
-        raise InputError(f"there are {count} {what} to train on and to validate by; expected at least 2: add {what}")
+        raise InputError(f"there are {count} {what} for training and validation; expected at least 2: add {what}")
     if not 0 < share < 1:
         raise InputError(f"validation_share is {share}; expected a number between 0 and 1")
     return min(max(1, round(share * count)), count - 1)
 
 
 def require_no_copies(seen: Trajectories, test: Trajectories) -> None:
-    """Raises `InputError` if a test trajectory is a copy of a training one; motionless ones are not compared."""
+    """Raises `InputError` if a test trajectory is a copy of a training one; skips motionless trajectories."""
 
     def contents(data: Trajectories) -> dict[int, int]:
         states = np.hstack([data.q, data.qd, data.qdd, data.tau])
@@ -281,13 +280,13 @@ def require_no_copies(seen: Trajectories, test: Trajectories) -> None:
     for content, index in contents(test).items():
         if content in known:
             raise InputError(
-                f"test trajectory '{test.label[index]}' is a copy of '{seen.label[known[content]]}', which is trained "
-                "on; remove one of them"
+                f"test trajectory '{test.label[index]}' is a copy of training trajectory "
+                f"'{seen.label[known[content]]}'; remove one of them"
             )
 
 
 def merged(sets: Split) -> Trajectories:
-    """All trajectories of a split in their original order."""
+    """Merges the trajectories of a split in their original order."""
     parts = [part for part in sets if len(part.t)]
     order = np.argsort(np.concatenate([part.trajectory for part in parts]), kind="stable")
     joined = {
@@ -299,19 +298,19 @@ def merged(sets: Split) -> Trajectories:
 
 
 def is_cut(text: str | None) -> bool:
-    """Whether a text asks for parts of trajectories rather than naming some."""
+    """Whether a text cuts trajectories (`last:30%`, `blocks`) instead of naming some."""
     return text is not None and (text.startswith("last:") or text == ALL_IN_BLOCKS)
 
 
 def stated_test(data: Trajectories, text: str | None) -> tuple[Trajectories, list[str] | None]:
-    """The data cut as the text asks, and the labels of the test; `None` leaves the choice to the split.
+    """Cuts the data as the text states, and returns the test labels; `None` leaves the choice to the split.
 
     `last:30%` holds out the last 30 % of the samples of every trajectory, as "LABEL[last]". `blocks` cuts every
-    trajectory into ten blocks of time. Anything else is a list of labels. A single trajectory is cut into blocks before
-    its last part, so that there is something to validate by.
+    trajectory into ten blocks of time. Other text is a list of labels. A single trajectory is cut into blocks before
+    its last part, which leaves data for validation.
 
     Raises:
-        InputError: a share that is not a percentage between 1 and 90, or a trajectory that is too short for it.
+        InputError: a percentage outside 1 to 90, or a trajectory that is too short for it.
     """
     if text is None or not is_cut(text):
         return data, None if text is None else [label.strip() for label in text.split(",")]

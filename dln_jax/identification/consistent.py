@@ -1,16 +1,17 @@
 """Physically consistent parameters: least squares over positive definite pseudo-inertias and positive coefficients.
 
 A body has the pseudo-inertia J = L M Lᵀ, where J_0 = L Lᵀ is its prior and M is symmetric and positive definite. M is
-relative to the prior, so its entries have no units. So has the armature matrix of coupled motors, whose other entries
-are zero. Armature of other motors and friction are c = c_0 exp(z). M and z minimise
+relative to the prior, so its entries have no units. The armature matrix of coupled motors has the same form; its
+entries between uncoupled motors are zero. All other armature and friction coefficients are c = c_0 exp(z). M and z
+minimise
 
     F = sum over joints of |Phi_j theta - tau_j|² / noise_j²  +  regularisation (sum of D(J | J_0) + sum of z² / 2)
 
 D(J | J_0) = tr M - log det M - n (n = 4 for a body) is the entropic divergence of Lee, Wensing and Park (T-RO 2020),
-which does not depend on the frame. The sum is convex in M, and D is a barrier for the physically consistent bodies. F
-is therefore minimised by an interior-point method (Boyd and Vandenberghe, Convex Optimization, chapter 11): Newton's
-method with a regularisation that falls to the requested value. The data enter as one triangular factor, so an iteration
-takes on the order of P³ operations, independent of the number of samples N.
+which does not depend on the frame. The sum is convex in M, and D is a barrier around the physically consistent bodies,
+so an interior-point method minimises F (Boyd and Vandenberghe, Convex Optimization, chapter 11): Newton's method with
+a regularisation that falls to the requested value. One triangular factor represents the data, so an iteration takes
+about P³ operations for any number of samples N.
 """
 
 from itertools import combinations_with_replacement
@@ -24,29 +25,29 @@ from dln_jax.mechanics.trees.inertia import body_of_pseudo_inertia, pseudo_inert
 from dln_jax.types import InputError, require_positive
 
 REGULARISATION = 1.0
-"""With this value, a body e times larger than its prior costs about as much as one measurement with an error of twice
-its noise, which is negligible wherever the data are informative."""
+"""At this value, a body e times larger than its prior costs about as much as one measurement with an error of twice its
+noise, which is negligible for informative data."""
 SMALLEST = 1e-6
-"""Eigenvalues of a prior pseudo-inertia below this fraction of the largest are raised to it."""
+"""Smallest eigenvalue of a prior pseudo-inertia relative to the largest; smaller ones are raised."""
 UNKNOWN_SHARE = 0.01
-"""Fraction of the torque that the initial value of a coefficient explains if its prior is zero."""
+"""Fraction of the torque that a coefficient with a zero prior explains at its initial value."""
 FALL = 5.0
-"""Ratio of the regularisation at one minimum to that at the next."""
+"""Ratio of the regularisation at successive minima."""
 CENTRED = 0.1
-"""An intermediate minimum counts as reached at this Newton decrement, in units of the regularisation."""
+"""Newton decrement at an intermediate minimum, in units of the regularisation."""
 TOLERANCE = 1e-10
-"""The search stops at this Newton decrement (expected decrease of F in another iteration), relative to 1 + F."""
+"""Newton decrement (expected decrease of F per iteration) at the end, relative to 1 + F."""
 _SYMMETRIC = np.array([np.outer(a, b) + np.outer(b, a) for a, b in combinations_with_replacement(np.eye(4), 2)])
 _BASIS = _SYMMETRIC / np.linalg.norm(_SYMMETRIC, axis=(1, 2), keepdims=True)
 """Orthonormal basis of the symmetric matrices [10, 4, 4]."""
 
 
 class ConsistentFit(NamedTuple):
-    """Physically consistent parameters and how the solver ended."""
+    """Physically consistent parameters and the state of the solver."""
 
     theta: ParameterVector
     divergence: Float[np.ndarray, " bodies"]
-    """D(J | J_0) of every body with inertia."""
+    """D(J | J_0) of each body with inertia."""
     iterations: int
     """Total number of Newton iterations."""
     converged: bool
@@ -59,7 +60,7 @@ def nearest_body(theta: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
     values, vectors = np.linalg.eigh(pseudo_inertia(theta))
     least = SMALLEST * values[-1]
     if not least > 0:
-        raise InputError("a link that is to be identified has no mass; expected a rough value for it")
+        raise InputError("a link to identify has no mass; expected a rough value")
     if values[0] >= least:
         return theta
     return np.asarray(body_of_pseudo_inertia((vectors * np.maximum(values, least)) @ vectors.T))
@@ -78,9 +79,10 @@ def fit_consistent(
     Args:
         triangle: triangular factor of the equations in units of noise, from `equations.whiten`.
         columns: columns of the P parameters; the ten of a body are adjacent.
-        known: prior and initial values. An inconsistent body is replaced by `nearest_body`, a zero coefficient by one
-            that explains a hundredth of the torque. A body with ten zeros is absent and stays zero.
-        regularisation: cost of a unit of divergence, in squares of the noise; positive, as data never determine all.
+        known: prior and initial values. `nearest_body` replaces an inconsistent body. A value that explains a hundredth
+            of the torque replaces a zero coefficient. A body with ten zeros is absent and stays zero.
+        regularisation: cost of a unit of divergence, in squares of the noise; positive, because data never determine
+            all parameters.
 
     Raises:
         InputError: `regularisation` is not positive, or a body has no mass.
@@ -123,14 +125,14 @@ def _minimum(
     regularisation: float,
     iterations: int,
 ) -> tuple[np.ndarray, list[np.ndarray], int, bool]:
-    """Minimises F with the residuals A y + r, y = (M - 1 of every block in its basis, exp(z) - 1, signed parameters).
+    """Minimises F with the residuals A y + r, y = (M - 1 of each block in its basis, exp(z) - 1, signed parameters).
 
     Args:
-        blocks: places in the unknowns, and basis [K, n, n], of every body and of the coupled motors.
-        logarithmic: places of z in the unknowns x, which hold it in place of exp(z) - 1.
+        blocks: indices in the unknowns, and basis [K, n, n], of each body and of the coupled motors.
+        logarithmic: indices of z in the unknowns x, which have z instead of exp(z) - 1.
 
     Returns:
-        y, M [n, n] of every block, the number of iterations, and whether they converged.
+        y, M [n, n] of each block, the number of iterations, and whether they converged.
     """
 
     def matrices(x: np.ndarray) -> list[np.ndarray]:
@@ -142,7 +144,7 @@ def _minimum(
         return y
 
     def value(x: np.ndarray, weight: float) -> float:
-        """F; infinite where a body is not physically consistent or z exceeds 100."""
+        """Returns F; infinite for inconsistent bodies or z above 100."""
         M, z = matrices(x), x[logarithmic]
         if any(np.linalg.eigvalsh(block)[0] <= 0 for block in M) or z.max(initial=0.0) > 100:
             return np.inf
@@ -150,11 +152,11 @@ def _minimum(
         return float(errors @ errors + weight * (_divergences(M).sum() + 0.5 * z @ z))
 
     def newton(x: np.ndarray, weight: float) -> tuple[np.ndarray, float]:
-        """The Newton step, solved as a least-squares problem for numerical stability, and its decrement."""
+        """Returns the Newton step, from a least-squares problem for numerical stability, and its decrement."""
         z, errors = x[logarithmic], A @ directions(x) + r
         slopes = A.copy()
         slopes[:, logarithmic] *= np.exp(z)
-        # The curvature of exp(z) enters only where it is positive, so that the step remains a descent direction.
+        # Only positive curvature of exp(z) counts, so that the step is a descent direction.
         bend = np.sqrt(weight / 2 + np.maximum(slopes[:, logarithmic].T @ errors, 0.0))
         rows, right = [slopes, bend[:, None] * np.eye(len(x))[logarithmic]], [-errors, -weight / 2 * z / bend]
         for (own, basis), M in zip(blocks, matrices(x), strict=True):
@@ -178,7 +180,7 @@ def _minimum(
         while value(x + length * step, weight) > now - 1e-4 * length * decrement:
             length /= 2
             if length < 1e-12:
-                # Rounding hides any further decrease; this counts as converged if the decrement is small enough.
+                # Rounding hides any further decrease; converged if the decrement is small enough.
                 return directions(x), matrices(x), done, last and decrement <= 1e-8 * (1 + now)
         x = x + length * step
         if not last and decrement <= CENTRED * weight:
@@ -187,5 +189,5 @@ def _minimum(
 
 
 def _divergences(blocks: list[np.ndarray]) -> np.ndarray:
-    """tr M - log det M - n of every block."""
+    """Returns tr M - log det M - n of each block."""
     return np.array([np.trace(M) - np.linalg.slogdet(M)[1] - len(M) for M in blocks])

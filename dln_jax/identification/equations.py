@@ -1,20 +1,20 @@
-"""Least-squares equations of a model linear in its parameters, the names of their columns, and base parameters.
+"""Least-squares equations of a linear model, names of their columns, and base parameters.
 
-The equations are compressed to one triangular factor per joint:
+One triangular factor per joint represents the equations:
 
     |Phi_j theta - tau_j|² = |R_j (theta, -1)|²,   [Phi_j tau_j] = Q_j R_j
 
 Reweighting joints, fixing parameters and changing unknowns then act on the [P + 1, P + 1] factors, not on the data.
 
-The columns follow from the model's parameters. The leaf `inertias` [links, 10] holds the inertial parameters of the
-bodies, the leaves of `coupling` one entry of the motors' armature matrix each; every other leaf has one entry per joint
-and gives its name to its columns. A new friction law therefore needs no change here.
+The columns follow from the model's parameters. The leaf `inertias` [links, 10] has the inertial parameters of the
+bodies, and each leaf of `coupling` has one entry of the motors' armature matrix. Every other leaf has one entry per
+joint and gives its name to its columns, so a new friction law needs no change here.
 
-Base parameters say which parameters are identifiable alone, which only in combination, and which not at all. Forces
-depend on P parameters through fewer combinations, the base parameters (Gautier and Khalil 1990; numerically
-Gautier 1991). The columns are visited in an order of preference. A column that is linearly independent of those before
-it is kept, in Phi_1; the others are Phi_2 = Phi_1 K, so that Phi theta = Phi_1 (theta_1 + K theta_2). Bodies nearer to
-the ground come first. Within a body, mass, h_z and I_yy come last: these are the parameters usually regrouped.
+Base parameters show which parameters are identifiable alone, which only in combination, and which not at all. Forces
+depend on P parameters through fewer combinations, the base parameters (Gautier and Khalil 1990; numerically Gautier
+1991). The columns are visited in an order of preference. A column that is linearly independent of earlier ones goes to
+Phi_1. The others are Phi_2 = Phi_1 K, so that Phi theta = Phi_1 (theta_1 + K theta_2). Bodies nearer to the ground come
+first. Within a body, mass, h_z and I_yy come last, since they are usually regrouped.
 """
 
 from collections.abc import Callable, Sequence
@@ -42,18 +42,18 @@ DEPENDENT = 1e-8
 dependent; so do singular values below this fraction of the largest. For random states this lies well between rounding
 errors and true residuals."""
 NEGLIGIBLE = 1e-12
-"""Columns shorter than this fraction of the longest are zero up to rounding: their terms cancel."""
+"""Columns shorter than this fraction of the longest count as zero, because their terms cancel up to rounding."""
 SHARE = 1e-6
-"""A parameter counts as identifiable alone if its share in the undetermined directions is below this number."""
+"""A parameter is identifiable alone if its share in the undetermined directions is smaller."""
 SHOWN = 1e-7
 """Coefficients below this fraction of the largest in their combination are rounding errors and set to zero."""
 BODIES, MOTORS, COUPLING = "inertias", "armature", "coupling_"
-"""Names of the leaves with the inertial parameters, ten columns per body, and with the motors' inertias; start of the
-names of columns off the diagonal of the armature, such as "coupling_2_3"."""
+"""Leaves with the inertial parameters (ten columns per body) and the motors' inertias, and prefix of columns for
+off-diagonal entries of the armature, such as "coupling_2_3"."""
 SIGNED = ("offset",)
-"""Endings of the names of leaves whose entries may have either sign."""
+"""Endings of leaf names with entries of either sign."""
 CHUNK = 2048
-"""Number of samples whose design matrix is in memory at a time."""
+"""Number of samples per chunk of the design matrix in memory."""
 
 
 class Columns(NamedTuple):
@@ -67,12 +67,12 @@ class Columns(NamedTuple):
 
     @property
     def bodies(self) -> Int[np.ndarray, "bodies 10"]:
-        """The ten columns of every body."""
+        """The ten columns of each body."""
         return np.flatnonzero(np.array(self.kinds) == "inertia").reshape(-1, 10)
 
     @property
     def motors(self) -> Int[np.ndarray, "n n"]:
-        """Columns of the entries of the coupled motors' armature matrix; -1 for an entry that is zero."""
+        """Columns for the entries of the coupled motors' armature matrix; -1 for zero entries."""
         columns = {name: column for column, name in enumerate(self.names)}
         coupled = [map(int, name.removeprefix(COUPLING).split("_")) for name in columns if name.startswith(COUPLING)]
         motors = sorted({motor for pair in coupled for motor in pair})
@@ -84,7 +84,7 @@ class Columns(NamedTuple):
 
 
 def columns_of(parameters: Parameters) -> Columns:
-    """Columns of a model with these parameters; outside `inertias` a column is named by its leaf and place in it."""
+    """Returns the columns of a model with these parameters; leaf and index name the columns outside `inertias`."""
     rows: list[tuple[str, Kind]] = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(parameters):
         name = jax.tree_util.keystr(path, simple=True, separator="_")
@@ -113,7 +113,7 @@ class Equations(NamedTuple):
 
 
 Regressor = Callable[[], Rows]
-"""Starts a pass over the equations: yields Phi [n, d, P] and tau [n, d] of n samples at a time, computed anew."""
+"""Starts a new pass over the equations, which yields Phi [n, d, P] and tau [n, d] in chunks of n samples."""
 
 
 def regressor_of(
@@ -127,15 +127,15 @@ def regressor_of(
 
     Args:
         model: a model that is linear in its parameters.
-        parameters: point where the model is differentiated and its linearity checked.
+        parameters: point for the derivative and the check of linearity.
         data: samples with tau.
-        free: [P]; columns where it is zero are set to zero, for parameters known to be zero.
+        free: [P]; zero for parameters known to be zero, which sets their columns to zero.
 
     Raises:
-        InputError: the data have no torques. A pass raises it if the model turns out not to be linear.
+        InputError: the data have no torques. A pass raises it if the model is not linear.
     """
     if "tau" in data.estimated:
-        raise InputError("the data have no tau; identification takes measured torques")
+        raise InputError("the data have no tau; identification needs measured torques")
     theta = flat(parameters)
     with jax.enable_x64(True):
         at = unravelled(theta, parameters)
@@ -165,17 +165,17 @@ def compress(regressor: Regressor, weights: JointSamples | None = None) -> Equat
 
 
 def whiten(equations: Equations, noise: JointVector) -> Float[np.ndarray, "K P_and_1"]:
-    """One triangular factor of all joints, with rows in units of the joint's noise."""
+    """Combines the triangular factors of all joints, with rows in units of the joint's noise."""
     return np.linalg.qr(np.concatenate(equations.triangles / noise[:, None, None]), mode="r")
 
 
 def squares(equations: Equations, theta: ParameterVector) -> JointVector:
-    """Sum of squared residuals over the samples, per joint."""
+    """Returns the sum of squared residuals over the samples, per joint."""
     return np.sum((equations.triangles @ np.append(theta, -1.0)) ** 2, axis=1)
 
 
 def residuals(regressor: Regressor, theta: ParameterVector) -> JointSamples:
-    """tau - Phi theta of every sample."""
+    """Returns tau - Phi theta of each sample."""
     return np.concatenate([tau - columns @ theta for columns, tau in regressor()])
 
 
@@ -183,18 +183,18 @@ class BaseParameters(NamedTuple):
     """B identifiable combinations of P parameters."""
 
     combinations: Float[np.ndarray, "B P"]
-    """beta = combinations theta; every row has a 1 in its independent column."""
+    """beta = combinations theta; each row has a 1 in its independent column."""
     independent: tuple[int, ...]
-    """Independent column of every combination."""
+    """Independent column of each combination."""
     words: tuple[str, ...]
     """Combinations as text, such as "I_xx_3 + 0.3 m_4"."""
 
 
 def base_parameters(A: Float[np.ndarray, "N P"], columns: Columns) -> BaseParameters:
-    """Finds the base parameters by the triangular factor of the columns in their order of preference.
+    """Finds the base parameters from the triangular factor of the columns in their order of preference.
 
     Args:
-        A: Phi in generic states, more of them than parameters, or its triangular factor.
+        A: Phi at more generic states than parameters, or its triangular factor.
         columns: names and kinds of the columns.
     """
     preferred = columns.bodies[:, [PARAMETERS.index(name) for name in PREFERRED]]
@@ -212,7 +212,7 @@ def base_parameters(A: Float[np.ndarray, "N P"], columns: Columns) -> BaseParame
 
 
 def in_words(combination: ParameterVector, names: Sequence[str], first: int) -> str:
-    """Writes a combination as a sum, starting with this column, whose factor is 1."""
+    """Writes a combination as a sum, starting with the column of factor 1."""
     others = np.flatnonzero(combination)
     text = names[first]
     for column in others[others != first]:
@@ -223,7 +223,7 @@ def in_words(combination: ParameterVector, names: Sequence[str], first: int) -> 
 
 
 def determinacy(A: Float[np.ndarray, "N P"]) -> tuple[Determinacy, ...]:
-    """Classifies every parameter as identifiable alone, in combination or not at all.
+    """Classifies each parameter as identifiable alone, in combination or not at all.
 
     Args:
         A: as for `null_directions`.
@@ -233,9 +233,9 @@ def determinacy(A: Float[np.ndarray, "N P"]) -> tuple[Determinacy, ...]:
 
 
 def null_directions(A: Float[np.ndarray, "N P"]) -> Float[np.ndarray, "K P"]:
-    """Orthonormal directions of the parameters that the equations do not determine, for columns scaled to unit length.
+    """Returns orthonormal directions that the equations do not determine, for columns scaled to unit length.
 
-    A column of zeros has a direction of its own.
+    Each column of zeros has its own direction.
 
     Args:
         A: Phi, or its triangular factor.

@@ -25,14 +25,14 @@ from dln_jax.types import InputError, JointKind, JointVector
 STATES = 40
 """Number of random states per joint for computing the structure."""
 UNSEEN_SHARE = 0.02
-"""Tolerance on the squared fraction of a parameter's identifiable part that the data miss: up to this fraction missed
-counts as seen, and up to this fraction seen counts as missed."""
+"""Tolerance on the squared fraction of a parameter's identifiable part that the data miss. Data that miss less see the
+parameter; data that see less miss it."""
 STILL = 0.01
-"""rad or m: a joint whose range is smaller counts as motionless."""
+"""rad or m: a joint with a smaller range is motionless."""
 LARGE_CONDITION = 300.0
-"""Above this condition number, errors grow much more along some combinations than along others."""
+"""Condition number above which errors differ strongly between combinations."""
 LONG_CORRELATION = 10.0
-"""Residuals with a longer correlation time, in samples, indicate model error rather than noise."""
+"""Correlation time of residuals, in samples, above which they are model errors rather than noise."""
 
 
 class Identification(NamedTuple):
@@ -42,21 +42,21 @@ class Identification(NamedTuple):
     known: ParameterVector
     """Prior values."""
     structure: tuple[Determinacy, ...]
-    """Structural identifiability: how arbitrary motions could determine every parameter."""
+    """Structural identifiability of each parameter, by arbitrary motions."""
     base: BaseParameters
-    """Combinations that arbitrary motions could determine."""
+    """Combinations that arbitrary motions can determine."""
     fit: WeightedFit
     """Least-squares fit to the data; its bodies may be physically inconsistent."""
     seen: tuple[Determinacy, ...]
-    """How these data determine every parameter."""
+    """Identifiability of each parameter by these data."""
     correlation: JointVector
-    """Correlation time of every joint's residuals of `fit`, in samples."""
+    """Correlation time of each joint's residuals of `fit`, in samples."""
     consistent: ConsistentFit | None
     """Physically consistent parameters, if requested."""
 
     @property
     def theta(self) -> ParameterVector:
-        """The physically consistent parameters if computed, otherwise those of least squares."""
+        """The physically consistent parameters if computed, otherwise the least-squares parameters."""
         return self.fit.theta if self.consistent is None else self.consistent.theta
 
 
@@ -77,26 +77,27 @@ def identify(
     Bodies without mass (links between the joints of one MJCF body) stay massless.
 
     Args:
-        model: such as `make_rigid_tree`.
-        known: prior parameters, such as those of a robot file; directions that the data do not determine keep them.
-        data: training data with tau; hold out other motions to judge the result.
-        joints: kinds of the joints, for drawing the random states; all revolute by default.
-        at: parameters at which the model is linearised, for friction by load, whose forces are linear as long as the
-            links' torques keep their signs: those of `learning.friction.fit_friction`.
-        noise: standard deviation of the torque of each joint [d], N m or N; estimated by default.
+        model: a linear model, for example from `make_rigid_tree`.
+        known: prior parameters, for example from a robot file; undetermined directions keep them.
+        data: training data with tau; hold out other motions for the evaluation.
+        joints: kinds of the joints, for drawing random states (default: all revolute).
+        at: parameters for linearising friction by load, from `learning.friction.fit_friction`; its forces are linear as
+            long as the links' torques keep their signs.
+        noise: standard deviation of each joint's torque noise [d], N m or N (default: estimated).
         robust: use Huber's loss, which grows linearly beyond 1.345 times the noise; the noise is then estimated.
         consistent: also fit physically consistent parameters.
         regularisation: as for `fit_consistent`.
 
     Raises:
-        InputError: no torques, numbers of joints that differ, a model that is not linear, or a setting out of range.
+        InputError: torques are missing, numbers of joints differ, the model is not linear, or a setting is out of
+            range.
     """
     d = data.degrees_of_freedom
     joints = ("revolute",) * d if joints is None else joints
     if len(joints) != d:
         raise InputError(f"the data have {d} joints, the robot {len(joints)}; make them agree")
     if robust and noise is not None:
-        raise InputError("noise is given, which a robust fit estimates; leave one of them out")
+        raise InputError("a robust fit estimates the noise itself; leave out noise or robust")
     columns, theta = columns_of(known), flat(known)
     free = np.ones(len(theta))
     free[columns.bodies] = theta[columns.bodies].any(axis=1, keepdims=True)  # no links without mass
@@ -122,12 +123,12 @@ def identify(
 
 
 def seen_by(fit: WeightedFit, base: BaseParameters, structure: tuple[Determinacy, ...]) -> tuple[Determinacy, ...]:
-    """Classifies how the data determine every parameter, relative to what motions could determine."""
+    """Classifies the identifiability of each parameter by the data, relative to arbitrary motions."""
     scaled = base.combinations / np.where(fit.lengths > 0, fit.lengths, np.inf)
     lengths = np.linalg.norm(scaled, axis=1)
     _, sizes, right = np.linalg.svd(scaled[lengths > 0] / lengths[lengths > 0, None], full_matrices=False)
     possible = np.sum(right[sizes > ROUNDING * sizes.max(initial=0.0)] ** 2, axis=0)
-    # `unseen` holds the structurally unidentifiable directions, subtracted here, and those that the data miss.
+    # `unseen` has structurally unidentifiable directions, subtracted here, and directions that the data miss.
     missed = np.sum(fit.unseen**2, axis=0) - (1 - possible)
     shown = possible > ROUNDING
     shares = np.where(shown, missed / np.where(shown, possible, 1.0), 1.0)
@@ -140,7 +141,8 @@ def seen_by(fit: WeightedFit, base: BaseParameters, structure: tuple[Determinacy
 
 
 def random_states(joints: tuple[JointKind, ...], samples: int, seed: int) -> Trajectories:
-    """Random states: angles on the full circle, displacements up to 1 m, normal rates (sd 2), accelerations (sd 5)."""
+    """Draws random states: full-circle angles, displacements up to 1 m, normal rates (sd 2) and accelerations (sd
+    5)."""
     shape, random = (samples, len(joints)), np.random.default_rng(seed)
     reach = np.where(np.array(joints) == "revolute", np.pi, 1.0)
     q, qd, qdd = random.uniform(-reach, reach, shape), 2 * random.normal(size=shape), 5 * random.normal(size=shape)
@@ -149,7 +151,7 @@ def random_states(joints: tuple[JointKind, ...], samples: int, seed: int) -> Tra
 
 
 def base_rows(result: Identification) -> list[dict[str, Any]]:
-    """One row per base parameter: the combination, its fitted value, standard error and prior value."""
+    """Returns a row per base parameter: combination, fitted value, standard error and prior value."""
     combinations = result.base.combinations
     numbers = (combinations @ result.fit.theta, result.fit.standard_errors(combinations), combinations @ result.known)
     keys = ("combination", "value", "standard_error", "known")
@@ -158,7 +160,7 @@ def base_rows(result: Identification) -> list[dict[str, Any]]:
 
 
 def parameter_rows(result: Identification) -> list[dict[str, Any]]:
-    """One row per parameter: structure, what the data determine, values, and the standard error if there is one."""
+    """Returns a row per parameter: identifiability by any motion and by the data, values, and any standard error."""
     names = result.columns.names
     errors = result.fit.standard_errors(np.eye(len(names)))
     errors = [error if seen == "alone" else None for error, seen in zip(errors.tolist(), result.seen, strict=True)]
@@ -169,7 +171,7 @@ def parameter_rows(result: Identification) -> list[dict[str, Any]]:
 
 
 def lost(result: Identification) -> tuple[str, ...]:
-    """Names of parameters that some motion could show, but these data do not."""
+    """Returns the names of parameters that other motions can determine, but these data do not."""
     return tuple(
         name
         for name, possible, seen in zip(result.columns.names, result.structure, result.seen, strict=True)
@@ -178,12 +180,12 @@ def lost(result: Identification) -> tuple[str, ...]:
 
 
 def findings(result: Identification, data: Trajectories, names: tuple[str, ...]) -> list[str]:
-    """Findings about the data, one line each with its remedy."""
+    """Returns findings about the data, one line each with a remedy."""
     lines = []
     still = np.flatnonzero(np.ptp(data.q, axis=0) < STILL)
     if len(still):
         which = ", ".join(names[k] for k in still)
-        lines.append(f"{which}: does not move; parameters that only its motion shows keep their values; record motions")
+        lines.append(f"{which}: does not move, so parameters that need its motion keep their values; record motions")
     if missing := lost(result):
         shown = ", ".join(missing[:12]) + (f" and {len(missing) - 12} more" if len(missing) > 12 else "")
         lines.append(f"determined by other motions, but not by these data: {shown}; vary speeds and postures more")
@@ -200,7 +202,7 @@ def findings(result: Identification, data: Trajectories, names: tuple[str, ...])
     rows = zip(result.columns.names, result.columns.kinds, result.fit.theta, strict=True)
     negative = [name for name, kind, value in rows if kind == "positive" and value < 0 and name not in missing]
     if negative and result.consistent is None:
-        lines.append(f"negative friction or armature: {', '.join(negative)}; ask for physically consistent parameters")
+        lines.append(f"negative friction or armature: {', '.join(negative)}; fit physically consistent parameters")
     if result.consistent is not None and not result.consistent.converged:
         lines.append(
             f"the search for physically consistent bodies did not converge in {result.consistent.iterations} "
@@ -210,7 +212,7 @@ def findings(result: Identification, data: Trajectories, names: tuple[str, ...])
 
 
 def summary(result: Identification) -> list[str]:
-    """How many parameters are identifiable, in two lines."""
+    """Returns two lines with the number of identifiable parameters."""
     counts = ", ".join(f"{result.structure.count(kind)} {kind}" for kind in get_args(Determinacy))
     return [
         f"{len(result.structure)} parameters; motions determine {counts}: {len(result.base.words)} base parameters",
@@ -219,7 +221,7 @@ def summary(result: Identification) -> list[str]:
 
 
 def text(result: Identification) -> str:
-    """The full report as plain text."""
+    """Returns the full report as plain text."""
     lines = [*summary(result), "", "base parameters: value ± standard error (before)"]
     for row in base_rows(result):
         lines.append(

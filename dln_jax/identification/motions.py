@@ -1,20 +1,20 @@
-"""Identification by motions: output error over short windows, alone or together with the equations of the torques.
+"""Identification by motions: output error over short windows, alone or together with the torque equations.
 
-    minimise over theta, the delay, and for every window w over its start z_w and a constant torque e_w
+    minimise over theta, the delay, and for each window w its start z_w and a constant torque e_w
 
         sum over samples |(q(t; z_w, theta) - q_measured) / noise_q|² + sum over windows |e_w / noise_tau|²
             + |R (theta, -1)|²   (equations of the torques in units of their noise, `equations.whiten`)
 
-The simulated motion is driven by tau(t - delay) + e_w. Starts and constant torques are eliminated window by window
-(Kaufman's derivative, `learning.shooting`). No acceleration is needed: forces that no log records, such as the
-vibration of a belt, enter torques of filtered motions but hardly move a joint.
+The torque tau(t - delay) + e_w drives the simulated motion. Starts and constant torques are eliminated window by window
+(Kaufman's derivative, `learning.shooting`). No accelerations are needed. Forces that no log records, such as the
+vibration of a belt, affect torques of filtered motions but hardly move a joint.
 
-Windows in which something unusual happened, such as a touch, are off by far more than others. A window whose residual
-is longer than the median counts by the median over its length (Huber), with weights from the previous fit.
+Windows with an unusual event, such as a touch, have much larger errors than others. The weight of a window with a
+residual above the median is the ratio of the median to its residual (Huber), from the previous fit.
 
-The residual is linearised at theta, which gives equations of the same kind as those of torques. The least-squares
-problems with physically consistent bodies are those of `consistent`, one per round; a step is halved until the sum
-decreases (consistent bodies form a convex set).
+Linearising the residual at theta gives equations of the same form as for torques. Each round solves one least-squares
+problem of `consistent`, with physically consistent bodies, and halves its step until the sum decreases (consistent
+bodies form a convex set).
 """
 
 import functools
@@ -38,16 +38,16 @@ from dln_jax.precision import compiled
 from dln_jax.types import InputError, JointVector, require_positive
 
 ROUNDS, SETTLED = 12, 1e-4
-"""Largest number of linearisations, and the smallest relative decrease of the sum that continues them."""
+"""Largest number of linearisations, and the smallest relative decrease of the sum for another one."""
 CHUNK = 16
-"""Number of windows that are linearised at a time; the last chunk is padded to it."""
+"""Number of windows per linearisation; the last chunk is padded."""
 REWEIGHTINGS = 2
 STABLE = 2.785
 """Largest product of time step and damping of a stable classical Runge-Kutta step."""
 MOST_GROWTH = 1e6
-"""If deviations grow more along a window, its derivatives have too few correct digits."""
+"""Largest growth of deviations along a window; beyond, its derivatives have too few correct digits."""
 STEPS = 0.5 ** np.arange(8)
-"""Fractions of a step that are tried."""
+"""Trial fractions of a step."""
 TYPICAL_DELAY = 1e-3
 """Unit of the delay among the unknowns, s."""
 
@@ -57,17 +57,17 @@ class MotionFit(NamedTuple):
 
     theta: ParameterVector
     delay: float
-    """Delay of the motions behind the logged torques, s."""
+    """Delay of the motions relative to the logged torques, s."""
     before: float
-    """Root mean square distance of the motions from the measurements at the initial parameters, in units of noise_q."""
+    """Root mean square error of the motions with the initial parameters, in units of noise_q."""
     after: float
-    """The same at the result."""
+    """The same for the result."""
     rounds: int
     converged: bool
 
 
 def cut_motions(data: Trajectories, length: int) -> tuple[MeasuredWindows, Float[np.ndarray, "W T d"]]:
-    """Consecutive windows of `length` samples, and the rate of tau in them, N m/s or N/s, which shifts it in time.
+    """Cuts consecutive windows of `length` samples; also returns the rate of tau, N m/s or N/s, for shifts in time.
 
     Raises:
         InputError: as for `cut_measured_windows`.
@@ -79,10 +79,10 @@ def cut_motions(data: Trajectories, length: int) -> tuple[MeasuredWindows, Float
 
 @functools.lru_cache(maxsize=4)
 def linearise(model: Model) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
-    """(unknowns [P + 1], noise_q [d], noise_tau [d], windows, slope) -> residuals [W, T d + d] and their derivatives.
+    """Returns (unknowns [P + 1], noise_q [d], noise_tau [d], windows, slope) -> residuals [W, T d + d], derivatives.
 
-    The last unknown is the delay, in units of `TYPICAL_DELAY`; the derivatives are [W, T d + d, P + 1]. Residuals are
-    those of the nearest starts.
+    The last unknown is the delay in units of `TYPICAL_DELAY`. The derivatives are [W, T d + d, P + 1]. Residuals belong
+    to the best starts.
     """
     like = shapes_of(model)
 
@@ -119,7 +119,7 @@ def linearise(model: Model) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
 
 @functools.lru_cache(maxsize=4)
 def _damping(model: Model) -> Callable[..., Array]:
-    """(theta [P], q [n, d], qd [n, d], tau [n, d]) -> d qdd / d qd [n, d, d]."""
+    """Returns (theta [P], q [n, d], qd [n, d], tau [n, d]) -> d qdd / d qd [n, d, d]."""
     like = shapes_of(model)
 
     def slopes(theta: Array, *state: Array) -> Array:
@@ -130,7 +130,7 @@ def _damping(model: Model) -> Callable[..., Array]:
 
 
 def _require_resolved(model: Model, theta: ParameterVector, windows: MeasuredWindows) -> None:
-    """Raises `InputError` if derivatives of most windows grow without bound, as with steep dry friction near rest.
+    """Raises `InputError` if derivatives of most windows grow without bound, for example by steep dry friction at rest.
 
     A classical Runge-Kutta step multiplies a deviation that decays as exp(-z) by 1 - z + z²/2 - z³/6 + z⁴/24, which
     exceeds one for z > 2.785. The motions themselves may stay finite.
@@ -141,12 +141,12 @@ def _require_resolved(model: Model, theta: ParameterVector, windows: MeasuredWin
         states = (np.concatenate(array[rows]) for array in (windows.q, windows.qd, windows.tau))
         damping = np.asarray(_damping(model)(theta, *states))
     if not np.isfinite(damping).all():
-        return  # the motions are not finite either, which has a message of its own
+        return  # non-finite motions have their own message
     z = step * np.abs(np.linalg.eigvals(damping)).max(axis=-1)
     growth = np.maximum(np.abs(1 - z + z**2 / 2 - z**3 / 6 + z**4 / 24), 1.0).reshape(CHUNK, -1).prod(axis=1)
     if np.median(growth) > MOST_GROWTH:
         raise InputError(
-            f"friction acts up to {z.max() / STABLE:.3g} times faster than the log's step of {step:.3g} s resolves; "
+            f"friction is up to {z.max() / STABLE:.3g} times too fast for the log's time step of {step:.3g} s; "
             "record faster or decimate less, or state a larger --velocity-scale"
         )
 
@@ -166,25 +166,26 @@ def fit_motions(
     """Fits physically consistent parameters to motions, and to torques too if their equations are given.
 
     Args:
-        model: a model that is linear in its parameters, such as `make_rigid_tree`.
-        prior: values that undetermined directions keep.
-        start: initial parameters with a positive definite mass matrix, such as consistent ones of a fit of torques.
+        model: a model that is linear in its parameters, for example from `make_rigid_tree`.
+        columns: columns of its parameters.
+        prior: prior values, which undetermined directions keep.
+        start: initial parameters with a positive definite mass matrix, for example consistent ones from torques.
         windows, slope: from `cut_motions`.
         noise_tau: standard deviation of a window's constant torque, N m or N.
-        torques: triangular factor of the torques' equations in units of noise.
-        reweightings: number of times that windows are weighted by their distance and the fit is repeated.
+        torques: triangular factor of the torque equations in units of noise.
+        reweightings: number of refits with windows weighted by their errors.
 
     Raises:
-        InputError: a noise that is not positive, motions too stiff for their time step, or a start whose
-            motions are not finite.
+        InputError: the noise is not positive, motions are too stiff for their time step, or initial motions are not
+            finite.
     """
     require_positive(noise_tau=float(np.min(noise_tau)))
     _require_resolved(model, start, windows)
     linearised, P, (_, samples, d) = linearise(model), len(start), windows.q.shape
     measured = windows.weight.sum()
     x = np.append(start, 0.0)
-    # The noise of q is the distance of the motions. The first round has a thousandth of the spread of q as noise; each
-    # moves the compromise between starts and torques.
+    # The error of the motions is the noise of q. It starts at a thousandth of the spread of q, and each round shifts
+    # the compromise between starts and torques.
     noise_q = spread = np.maximum(1e-3 * windows.q.reshape(-1, d).std(axis=0), np.finfo(float).tiny)
     for _ in range(2):
         left = linearised(x, noise_q, noise_tau, windows, slope)[0][:, : samples * d]
@@ -205,7 +206,7 @@ def fit_motions(
     for _ in range(1 + reweightings):
         left, slopes, total = at(x, weight)
         if not np.isfinite(total):
-            raise InputError("motions simulated with the initial fit are not finite; record faster, or filter less")
+            raise InputError("motions simulated with the initial fit diverge; record faster, or filter less")
         last, converged = rounds + ROUNDS, False
         while rounds < last and not converged:
             rounds += 1

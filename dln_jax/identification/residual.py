@@ -1,8 +1,8 @@
-"""A small residual network on top of an identified tree, no larger than held-out motions justify.
+"""A small residual network on top of an identified tree, as large as held-out motions justify.
 
-The parameters of the tree are frozen. The candidates grow from no network at all. One replaces another only if its
-error on validation motions is lower by more than the standard error of the difference. That error is computed over
-segments of time assumed to be independent, since neighbouring samples are not.
+The parameters of the tree are fixed. The first candidate is no network, and later ones grow. A candidate replaces the
+previous one only if it lowers the error on validation motions by more than the standard error of the difference. The
+standard error is computed over segments of time, since neighbouring samples are correlated.
 """
 
 from typing import Any
@@ -38,10 +38,10 @@ Selected = tuple[Model, Parameters, dict[str, Any]]
 
 
 def inner_split(train: Trajectories) -> tuple[Trajectories, Trajectories]:
-    """Training data without every fourth trajectory or block, and those, to choose the size of a network by."""
+    """Holds out every fourth training trajectory or block, for choosing the size of a network."""
     present = np.unique(train.trajectory)
     if len(present) < 2:
-        raise InputError("a part to choose by takes two trajectories or blocks to fit; record more motions")
+        raise InputError("choosing a network needs at least two trajectories or blocks to fit; record more motions")
     return trajectories(train, np.setdiff1d(present, present[1::4])), trajectories(train, present[1::4])
 
 
@@ -55,21 +55,22 @@ def fit_residual(
     candidates: tuple[Candidate, ...] = CANDIDATES,
     iterations: int = 40,
 ) -> Selected:
-    """Fits residual networks to the torques unexplained by an identified tree, and selects the smallest sufficient one.
+    """Fits residual networks to the torques that an identified tree does not explain, and selects the smallest one.
 
-    Returns the sum of both, its `ResidualParameters` and the keywords of `make_residual`; or the tree's own model and
-    parameters and no keywords, if no network was selected.
+    Returns the sum of tree and network, its `ResidualParameters` and the keywords of `make_residual`. If no network
+    improves the tree, returns the tree's model and parameters without keywords.
 
     Args:
-        rigid: such as `make_rigid_tree`.
+        rigid: the tree, for example from `make_rigid_tree`.
         parameters: identified parameters, which stay fixed.
-        train: data that the tree was identified from.
-        validation: other motions, used for selection; judge the result on yet others.
-        candidates: networks in order of size; every one has to improve on those before it, and the first on none.
-        iterations: upper limit of Gauss-Newton iterations; the parameters with the lowest validation error are kept.
+        needs: needs of the tree.
+        train: training data of the tree.
+        validation: other motions for the selection; evaluate the result on further ones.
+        candidates: networks in order of size; each must improve on the previous ones, and the first on no network.
+        iterations: largest number of Gauss-Newton iterations; the parameters with the lowest validation error are kept.
 
     Raises:
-        InputError: the torques do not vary.
+        InputError: the torques are constant.
     """
     with jax.enable_x64(True):
         scale = torque_scale(train)

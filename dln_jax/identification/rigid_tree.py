@@ -1,15 +1,15 @@
-"""A robot as a model: friction with fitted shapes, and terms that only cross-validation adds.
+"""A robot as a model: friction with fitted shapes, and extra terms chosen by cross-validation.
 
-Any extra term lowers the error on its own training data, whether or not the plant has it. `choose_terms` therefore
-keeps a term only if it lowers the error in cross-validation over trajectories (or blocks of time) by more than `MARGIN`
-standard errors. Such terms are coupled motors, friction that depends on load, and friction that depends on temperature.
+An extra term always lowers the training error, whether or not the plant has it. `choose_terms` therefore keeps a term
+only if it lowers the cross-validation error over trajectories (or blocks of time) by more than `MARGIN` standard
+errors. The terms are coupled motors, friction by load, and friction by temperature.
 
-`shared_motor` looks for motors that turn with two joints, such as those of coupled wrists, in torques that a fit leaves
-unexplained. A motor with the rate m = qd_j + c qd_i, i < j, has friction F(m), which acts on both joints:
+`shared_motor` searches the unexplained torques of a fit for motors that turn with two joints, for example in coupled
+wrists. A motor with the rate m = qd_j + c qd_i, i < j, has friction F(m), which acts on both joints:
 
     left_j = F_j(qd_j) + F(m),    left_i = F_i(qd_i) + c F(m),    F(v) = b v + k tanh(v / s)
 
-Its share is what F(m) explains beyond friction of the joints' own rates, in that joint of the two where it is less.
+Its share is the fraction that F(m) explains beyond friction by the joints' own rates; the smaller one of both joints.
 """
 
 import functools
@@ -49,18 +49,18 @@ from dln_jax.types import FrictionLaw, JointSamples, Needs
 from dln_jax.zoo.descriptions import Description, build, describe
 
 MOST_SAMPLES, FEWER_SAMPLES = 4_000, 2_000
-"""Largest number of samples used to fit the shapes of friction, and for the fits of a cross-validation."""
+"""Largest number of samples for fitting the shapes of friction, and for each fit of a cross-validation."""
 FOLDS = 4
 MARGIN = 2.0
-"""A term must lower the error by this number of standard errors; about one log in forty does so by chance."""
+"""A term must lower the error by this number of standard errors; chance does so in about one log in forty."""
 RATIOS = (-2.0, -1.5, -1.0, -0.75, -0.5, -0.25, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
-"""Values of c that are tried."""
+"""Trial values of c."""
 SHARE = 0.3
 """Smallest share of the unexplained variance in both joints."""
 SMOOTH = 0.1
-"""s, as a share of the root mean square rate."""
+"""Velocity scale s relative to the root mean square rate."""
 MOST = 4000
-"""Number of samples that is enough to find a motor."""
+"""Largest number of samples for finding a motor."""
 
 
 def describe_rigid_tree(
@@ -75,14 +75,16 @@ def describe_rigid_tree(
 ) -> tuple[Description, FrictionFit | None, list[str]]:
     """Describes a robot with the terms that cross-validation keeps, and fits the shapes of its friction.
 
-    Returns the description, the fit of friction if it has a shape to fit, and a line on every term that was tried.
+    Returns the description, the friction fit if there is a shape to fit, and a line for each trial term.
 
     Args:
-        needs: needs of the tree, with its friction laws; "load" is kept only if cross-validation favours it.
-        velocity_scale: that of dry friction, rad/s or m/s (default: fitted).
+        robot: the robot.
+        needs: needs of the tree with its friction laws; cross-validation decides on "load".
+        train: training data.
+        velocity_scale: velocity scale of dry friction, rad/s or m/s (default: fitted).
         cooling: whether viscous friction may fall with temperature.
         motors: rows of S in the motor rates S qd.
-        coupled: pairs of joints whose motors may share an inertia.
+        coupled: pairs of joints with motors that may share an inertia.
 
     Raises:
         InputError: as for `fit_friction`.
@@ -96,7 +98,7 @@ def describe_rigid_tree(
         if is_identifiable(tree, motors, pair):
             additions[name] = {"coupled": (pair,)}
         else:
-            lines.append(f"{name}: left out, as other inertias explain all its torques; state --motors if it is known")
+            lines.append(f"{name}: left out, since other inertias explain its torques; state --motors if it is known")
     if "load" in needs.joint_friction:
         additions["friction by load"] = {"laws": ("load",)}
     if cooling:
@@ -112,7 +114,7 @@ def describe_rigid_tree(
 
 
 def build_rigid_tree(description: Description, robot: Robot) -> tuple[Model, Parameters]:
-    """The model of a description, and its parameters by the robot's file."""
+    """Builds the model of a description, with parameters from the robot's file."""
     model = build(description)
     known = model.init(jax.random.key(0))
     stated = {"viscous": robot.damping, "coulomb": robot.coulomb}
@@ -122,7 +124,7 @@ def build_rigid_tree(description: Description, robot: Robot) -> tuple[Model, Par
 
 
 def is_identifiable(tree: Tree, motors: Rows | None, pair: Pair) -> bool:
-    """Whether torques of arbitrary motions tell the armature of a pair from inertias of links and motors."""
+    """Whether arbitrary motions distinguish the armature of a pair from the inertias of links and motors."""
     states = random_states(tree.joints, STATES * tree.degrees_of_freedom, 0)
     with jax.enable_x64(True):
         links = known_of(tree, states, Terms((), motors=motors, coupled=(pair,)), noise=1.0).links
@@ -132,13 +134,13 @@ def is_identifiable(tree: Tree, motors: Rows | None, pair: Pair) -> bool:
 def choose_terms(
     tree: Tree, data: Trajectories, terms: Terms, additions: Mapping[str, Mapping[str, Any]]
 ) -> tuple[Terms, list[str], list[str]]:
-    """Tries additions one after another and keeps those that lower the cross-validation error significantly.
+    """Tries additions one by one and keeps each that significantly lowers the cross-validation error.
 
-    Returns the terms, the names of the additions kept, and a line on every addition. Errors are mean squares in
+    Returns the terms, the names of the kept additions, and a line for each addition. Errors are mean squares in
     cross-validation, summed over joints, in units of each torque's variance.
 
     Args:
-        additions: what each candidate adds to entries of `terms`, by its name, such as {"laws": ("load",)}.
+        additions: name -> additions to entries of `terms`, such as {"laws": ("load",)}.
 
     Raises:
         InputError: as for `fit_friction`.
@@ -165,7 +167,7 @@ def choose_terms(
 
 
 def cross_validate(tree: Tree, data: Trajectories, terms: Terms) -> Float[np.ndarray, " segments"]:
-    """Mean squared error of every segment, from fits to the folds without it."""
+    """Returns the mean squared error of each segment, from fits to the other folds."""
     fold_of = np.unique(data.trajectory, return_inverse=True)[1] % FOLDS
     fewest = len(fold_of) - np.bincount(fold_of).max()
     with jax.enable_x64(True):
@@ -174,7 +176,7 @@ def cross_validate(tree: Tree, data: Trajectories, terms: Terms) -> Float[np.nda
         squares = np.zeros(len(data.t))
         for fold in range(FOLDS):
             held, rest = fold_of == fold, np.flatnonzero(fold_of != fold)
-            # The same number of samples in every fold, so that one compiled program serves all.
+            # Every fold has the same number of samples, so that one compiled program serves all.
             rows = rest[np.linspace(0, len(rest) - 1, fewest).round().astype(int)]
             solution = solve_terms(terms, Known(*(part[rows] for part in known)), design)
             whole = known._replace(signs=link_signs(terms, known, solution))
@@ -186,10 +188,10 @@ def cross_validate(tree: Tree, data: Trajectories, terms: Terms) -> Float[np.nda
 def at_reference(
     description: Description, model: Model, parameters: Parameters, *logs: Trajectories
 ) -> list[Trajectories]:
-    """Logs with the torques at the reference temperature, by the friction of a fit; unchanged without such friction."""
+    """Converts torques to the reference temperature, by the fitted friction; unchanged if it does not depend on it."""
     if not np.any(description["cooling"]):
         return list(logs)
-    energies: Any = model.energies  # of a rigid tree, which takes a temperature too
+    energies: Any = model.energies  # a rigid tree takes a temperature too
 
     def warmer(q: Any, qd: Any, temperature: Any) -> Any:
         reference = description["reference_temperature"]
@@ -202,7 +204,7 @@ def at_reference(
 
 
 def shared_motor(left: JointSamples, qd: JointSamples) -> tuple[int, int, float, float] | None:
-    """Returns j, i (from 0), c and the share of the motor that explains most; `None` if none explains enough."""
+    """Returns j, i (from 0), c and the share of the best motor; `None` if no motor explains enough."""
     from scipy.linalg import block_diag  # imported here, after commands have set BLAS's threads
 
     scale, best = left.std(axis=0), None
@@ -225,6 +227,6 @@ def _friction(rate: np.ndarray) -> np.ndarray:
 
 
 def _unexplained(A: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Mean square of what least squares leave of both joints."""
+    """Returns the mean squared residual of least squares for both joints."""
     left = y - A @ np.linalg.lstsq(A, y, rcond=None)[0]
     return np.mean(left.reshape(2, -1) ** 2, axis=1) + 1e-300

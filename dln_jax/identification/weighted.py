@@ -1,11 +1,11 @@
-"""Weighted and robust least squares with standard errors; the weights follow from the residuals of each joint.
+"""Weighted and robust least squares with standard errors; the residuals of each joint give the weights.
 
     theta minimises sum over joints of |Phi_j theta - tau_j|² / noise_j²
 
-Directions that the data do not determine keep their prior values: of all theta that fit equally well, the solution is
-the nearest to the prior, in units of the columns' lengths. The noise is noise_j² = |residual_j|² / (N - share of the
-parameters that joint j determines); fit and noise alternate until the noise converges. The covariance of theta assumes
-independent errors of this size; of residuals correlated over T samples, T count as one (`correlation_times`).
+Undetermined directions keep their prior values: among all theta that fit equally well, the solution is nearest to the
+prior, in units of the columns' lengths. The noise is noise_j² = |residual_j|² / (N - share of the parameters that joint
+j determines); fit and noise alternate until the noise converges. The covariance of theta assumes independent errors of
+this size. If residuals are correlated over T samples, T samples count as one (`correlation_times`).
 """
 
 from typing import NamedTuple
@@ -37,7 +37,7 @@ THRESHOLD = 1.345
 TO_DEVIATION = 1.4826
 """Ratio of the standard deviation of normal errors to their median absolute value."""
 REWEIGHTINGS, SETTLED = 30, 1e-4
-"""Largest number of robust reweightings, and the smallest relative change of the residuals that continues them."""
+"""Largest number of robust reweightings, and the smallest relative change of the residuals for another one."""
 
 
 class WeightedFit(NamedTuple):
@@ -45,22 +45,22 @@ class WeightedFit(NamedTuple):
 
     theta: ParameterVector
     covariance: Float[np.ndarray, "P P"]
-    """Includes every direction with an effect on the data, even those too weak to be used in the fit."""
+    """Includes all directions with an effect on the data, even if too weak for the fit."""
     noise: JointVector
     """Standard deviation of the residual of each joint, N m or N."""
     rank: int
     """Number of combinations that the data determine."""
     condition: float
-    """Largest over smallest singular value used, for columns of unit length."""
+    """Ratio of the largest to the smallest singular value in the fit, for columns of unit length."""
     unseen: Float[np.ndarray, "K P"]
     """Orthonormal directions along which theta keeps its prior value, in units of the columns' lengths."""
     without_effect: Float[np.ndarray, "M P"]
-    """Returns the directions of `unseen` that have no effect on the data."""
+    """Directions of `unseen` without effect on the data."""
     lengths: ParameterVector
     """Lengths of the columns in units of noise; zero for columns without effect."""
 
     def standard_errors(self, combinations: Float[np.ndarray, "B P"]) -> Float[np.ndarray, " B"]:
-        """Standard errors of combinations of parameters; infinite if part of one has no effect on the data."""
+        """Returns standard errors of combinations of parameters; infinite if a part has no effect on the data."""
         scaled = combinations / np.where(self.lengths > 0, self.lengths, 1.0)
         undetermined = np.linalg.norm(scaled @ self.without_effect.T, axis=1) > 1e-4 * np.linalg.norm(scaled, axis=1)
         variance = np.einsum("bp,pq,bq->b", combinations, self.covariance, combinations)
@@ -76,14 +76,16 @@ def fit_weighted(
 ) -> WeightedFit:
     """Fits the parameters by weighted least squares.
 
-    Singular values of unit-length columns count as zero below the inverse of the torque in units of its noise, relative
-    to the largest, or below 1e-10: along such a direction even an effect as large as all torque would not rise above
-    the noise.
+    Singular values of unit-length columns, relative to the largest, count as zero below 1e-10 or below the ratio of the
+    noise to the torque. Along such a direction, an effect as large as the whole torque would not exceed the noise.
 
     Args:
+        data: compressed equations.
         known: prior values.
-        noise: standard deviation of each joint's torque, N m or N; estimated by default, starting from equal noise.
-        correlation: correlation time of each joint's residuals in samples; the covariance counts that many as one.
+        noise: standard deviation of each joint's torque noise, N m or N (default: estimated, starting from equal
+            noise).
+        correlation: correlation time of each joint's residuals in samples; that many samples count as one in the
+            covariance.
 
     Raises:
         InputError: noise is not positive, tau is zero, or samples are too few.
@@ -91,11 +93,11 @@ def fit_weighted(
     d = len(data.triangles)
     torque = np.sqrt(np.sum(data.triangles[:, :, -1] ** 2, axis=1) / data.samples)
     if not torque.any():
-        raise InputError("tau is zero in every sample; identification takes measured torques")
+        raise InputError("tau is zero in all samples; identification needs measured torques")
     if noise is not None and not (np.shape(noise) == (d,) and np.all(np.asarray(noise) > 0)):
-        raise InputError(f"noise is {noise}; expected a positive number for each of {d} joints")
+        raise InputError(f"noise is {noise}; expected {d} positive numbers, one per joint")
     if data.samples * d <= len(known):
-        raise InputError(f"{data.samples} samples of {d} joints for {len(known)} parameters; record more")
+        raise InputError(f"{data.samples} samples of {d} joints are too few for {len(known)} parameters; record more")
     shifted = data._replace(triangles=data.triangles.copy())  # for theta - known as the unknown
     shifted.triangles[:, :, -1] -= data.triangles[:, :, :-1] @ known
     sigma = np.full(d, torque.mean()) if noise is None else np.asarray(noise, float)
@@ -113,7 +115,8 @@ def fit_weighted(
 def _solve(
     data: Equations, sigma: np.ndarray, correlation: np.ndarray | None, rank_tolerance: float
 ) -> tuple[WeightedFit, np.ndarray]:
-    """The fit for these noise levels, and every joint's share in determining the parameters; shares sum to the rank."""
+    """Fits at these noise levels; also returns each joint's share of the determined parameters (the sum is the
+    rank)."""
     triangle = whiten(data, sigma)
     scaled, lengths = scaled_columns(triangle[:, :-1], NEGLIGIBLE)
     effective = scaled.any(axis=0)
@@ -121,7 +124,7 @@ def _solve(
     rank, effects = (int(np.sum(sizes > t * sizes[0])) for t in (rank_tolerance, ROUNDING))
     to_theta = (right[:effects] / sizes[:effects, None]).T / lengths[:, None]
     to_theta[~effective] = 0.0  # large torques in units of small noise would amplify rounding here
-    # Rows of each joint in the basis of directions with an effect: their squares sum to one over all joints.
+    # Rows of each joint in the basis of effective directions; their squares sum to one over all joints.
     by_joint = data.triangles[:, :, :-1] / sigma[:, None, None] @ to_theta
     times = np.ones(len(sigma)) if correlation is None else correlation
     middle = np.einsum("d,dki,dkj->ij", times, by_joint, by_joint)
@@ -139,10 +142,10 @@ def _solve(
 
 
 def correlation_times(errors: JointSamples, trajectory: np.ndarray) -> JointVector:
-    """Correlation time of every joint's residuals in samples; 1 for independent ones.
+    """Returns the correlation time of each joint's residuals in samples; 1 for independent residuals.
 
-    1 + 2 sum of autocorrelations within trajectories, up to the first pair of lags whose sum is not positive (Geyer
-    1992).
+    The time is 1 + 2 sum of autocorrelations within trajectories, up to the first pair of lags with a sum that is not
+    positive (Geyer 1992).
     """
     from scipy.signal import fftconvolve
 
@@ -158,13 +161,13 @@ def correlation_times(errors: JointSamples, trajectory: np.ndarray) -> JointVect
 
 
 def fit_robust(regressor: Regressor, known: ParameterVector) -> tuple[WeightedFit, JointSamples]:
-    """Huber's estimate: the loss grows linearly instead of quadratically beyond `THRESHOLD` times the noise.
+    """Fits with Huber's loss, which grows linearly instead of quadratically beyond `THRESHOLD` times the noise.
 
-    Iteratively reweighted least squares with weights min(1, threshold noise / |error|), returned with the fit; the
-    noise is estimated from the median absolute error.
+    Iteratively reweighted least squares with weights min(1, threshold noise / |error|), which are returned with the
+    fit. The median absolute error gives the noise.
 
     Args:
-        regressor: equations of the data; every iteration takes two passes.
+        regressor: equations of the data; each iteration takes two passes.
         known: prior values.
 
     Raises:

@@ -2,6 +2,6 @@
 
     training = fit(dynamics.problem(model, split(data)), GaussNewton())
 
-`dynamics`, `matching`, `shooting`, `frames` and `functions` build problems. Models
-that are linear in their parameters are solved directly. `uncertainty` estimates the uncertainty of a fitted model.
+`dynamics`, `matching`, `shooting` and `functions` build problems. Models that are linear in their parameters are solved
+directly. `uncertainty` estimates the uncertainty of a fitted model.
 """

@@ -2,9 +2,9 @@
 
     training = fit(problem(model, sets, objective), GaussNewton())
 
-`suited_network` chooses the structured network, its optimiser and its number of samples for an arm of many joints.
-Measured on the simulated arm of seven axes (viscous friction, no noise): mean nMSE on twelve unseen motions after half
-a minute of processor time; two numbers are two seeds.
+`suited_network` chooses the structured network, its optimiser and its number of samples for an arm of many joints. The
+table has the mean nMSE on twelve unseen motions of the simulated seven-axis arm (viscous friction, no noise), after
+half a minute of processor time. Two numbers are two seeds.
 
     motions of 10 s                                15               30      75
     independent equations per parameter             4                8      19
@@ -13,16 +13,16 @@ a minute of processor time; two numbers are two seeds.
 
 With 15 motions, wider and deeper small networks (16 x 16, 32) reached the same 0.025 more slowly, 8 units reached
 0.056, and a ridge did not help. A Gauss-Newton step takes about N d P² operations to form JᵀJ, and neighbouring samples
-of a motion are redundant, so a subset is enough. A small network is limited by its capacity, a large one by the
-information in the motions: the number of independent equations decides between them.
+of a motion are redundant, so a subset is enough. Capacity limits a small network and the information in the motions
+limits a large one, so the number of independent equations decides between them.
 
-`summed_with_friction` finds forces of friction that the data cannot tell apart from those of a potential.
-A potential whose slope may be any constant represents the offset of friction as well, and dry friction of a joint that
-moves one way only: torques determine their sum. A polynomial of a prismatic displacement is such a potential. A network
-of the cosine and sine of an angle becomes one if the recorded angles leave a gap in the circle.
+`summed_with_friction` finds friction forces that the data cannot distinguish from potential forces.
+If a potential can have any constant slope, it also represents the offset of friction, and the dry friction of a joint
+that moves in one direction only. Torques then determine only their sum. A polynomial of a prismatic displacement is
+such a potential. A network of the cosine and sine of an angle is one if the recorded angles leave a gap in the circle.
 
-Other friction is no such gauge. Over a closed path in the states (q, qd) it takes work, and forces of a Lagrangian take
-none; terms linear in qd, A(q)ᵀ qd, only add the gyroscopic force (dA/dq - dA/dqᵀ) qd, whose power is zero.
+Other friction can be distinguished. Over a closed path in the states (q, qd) it dissipates work, but forces of a
+Lagrangian do not: terms linear in qd, A(q)ᵀ qd, only add the gyroscopic force (dA/dq - dA/dqᵀ) qd with zero power.
 """
 
 from collections.abc import Sequence
@@ -48,7 +48,7 @@ from dln_jax.types import Needs, SampleVector, require_seed
 MANY_JOINTS = 4
 """Arms with fewer joints get a small network and all their samples."""
 WIDTH = 16
-"""Width of the hidden layer that mass matrix and potential share."""
+"""Width of the hidden layer shared by mass matrix and potential."""
 ROWS_PER_PARAMETER = 14
 """Equations per parameter in a Gauss-Newton step. For 16 x 16 units, seven did equally well."""
 MOST_INDEPENDENT = 6
@@ -56,16 +56,16 @@ MOST_INDEPENDENT = 6
 
 
 CIRCLE = 6.0
-"""Range of angles that leaves no gap in the circle, rad: small networks do not bridge the last 0.28 rad."""
+"""Range of angles that counts as a full circle, rad: small networks do not bridge the last 0.28 rad."""
 
 
 def problem(model: Model, sets: Split, objective: Objective = TORQUE, *, seeds: int | Sequence[int] = 0) -> Problem:
-    """Builds the problem of fitting a model to an objective, in the precision of the model.
+    """Builds the problem of fitting a model to an objective, in the model's precision.
 
     Args:
         sets: samples for training, for selecting the parameters, and for monitoring.
         objective: residual to minimise, from `learning.objectives`.
-        seeds: seeds of initial parameters and sample order; several train in one program and add an axis to results.
+        seeds: seeds for initial parameters and sample order; several train in one program and add an axis to results.
 
     Raises:
         InputError: the data cannot determine the model, lack a key of the objective, or overflow in its precision.
@@ -90,13 +90,13 @@ def problem(model: Model, sets: Split, objective: Objective = TORQUE, *, seeds: 
 
 
 def validation_errors(model: Model, sets: Split, parameters: Parameters, objective: Objective = TORQUE) -> SampleVector:
-    """Squared error of every validation sample; their mean selects the parameters."""
+    """Returns the squared error of every validation sample; their mean selects the parameters."""
     scale, (_, batch, _) = _read(model, sets, objective)
     return np.asarray(jax.jit(lambda theta: _squares(objective, model, theta, batch, scale))(parameters))
 
 
 def suited_optimiser(model: Model, sets: Split, objective: Objective = TORQUE) -> tuple[str, str]:
-    """Returns the name of the optimiser that suits the sizes of the model and the data, and the reason."""
+    """Returns the name of the optimiser that suits the size of model and data, and the reason."""
     return optimisers.suited(shapes_of(model), len(sets.train.t), len(objective.scale(sets.train)))
 
 
@@ -106,9 +106,9 @@ class Suited(NamedTuple):
     optimizer: str
     """gauss-newton or adam."""
     keywords: dict[str, int | bool]
-    """Keywords of `make_delan`: width, depth, and whether networks share a trunk."""
+    """Keywords of `make_delan`: width, depth and shared_trunk."""
     steps: int
-    """Steps of the optimiser that take half a minute."""
+    """Number of optimiser steps, which take half a minute."""
     samples: int | None
     """Number of samples drawn for the fit; `None` for all."""
     reason: str
@@ -123,23 +123,23 @@ def suited_network(needs: Needs, train: Trajectories) -> Suited:
     reason = f"{independent:,} independent equations for the {size:,} parameters of a small network"
     if independent > MOST_INDEPENDENT * size:
         large = {"width": 64, "depth": 2, "shared_trunk": False}
-        return Suited("adam", large, 6_000, None, f"{reason}: a large one holds more")
+        return Suited("adam", large, 6_000, None, f"{reason}, so a large network learns more")
     samples = ROWS_PER_PARAMETER * size // d
-    drawn = f"; {samples:,} of {len(train.t):,} samples are fitted" if samples < len(train.t) else ""
+    drawn = f"; {samples:,} of {len(train.t):,} samples are used" if samples < len(train.t) else ""
     return Suited("gauss-newton", small, 40, samples, reason + drawn)
 
 
 def independent_equations(data: Trajectories) -> int:
-    """d times the effective sample size of the accelerations (median over joints); independent of the sampling rate."""
+    """Returns d times the effective sample size of the accelerations (median of joints), for any sampling rate."""
     counts = [effective_samples(column - column.mean(), data.trajectory) for column in data.qdd.T]
     return round(data.degrees_of_freedom * float(np.median(counts)))
 
 
 def summed_with_friction(needs: Needs, data: Trajectories, *, network: bool) -> list[int]:
-    """Returns the joints, counted from 1, whose gravity and friction are known only in sum.
+    """Returns the joints, counted from 1, for which the data determine only the sum of gravity and friction.
 
     Args:
-        needs: the model's; gravity means a potential.
+        needs: needs of the model; gravity means a potential.
         data: the training data.
         network: whether the potential is a network; otherwise it is a polynomial, of cos q and sin q for angles.
     """
@@ -157,12 +157,12 @@ def without_offset(needs: Needs) -> Needs:
 
 
 def _read(model: Model, sets: Split, objective: Objective) -> tuple[np.ndarray, list[tuple[Array, ...]]]:
-    """Returns the scale of the residuals, and the arrays of every set."""
+    """Returns the scale of the residuals and the arrays of each set."""
     dtype = jnp.result_type(*jax.tree.leaves(shapes_of(model)))
     return objective.scale(sets.train).astype(dtype), [arrays_of(data, objective.keys, dtype) for data in sets]
 
 
 def _squares(objective: Objective, model: Model, parameters: Any, batch: tuple[Array, ...], scale: np.ndarray) -> Array:
-    """Squared error of every sample of a batch, in the units of the validation error."""
+    """Returns the squared error of each sample of a batch, in the units of the validation error."""
     errors = objectives.residuals(objective, model.energies(parameters), batch)
     return jnp.sum((errors if objective.selects_by == "torque" else errors / scale) ** 2, axis=1)

@@ -1,4 +1,4 @@
-"""The result of a fit: a model with its parameters, and how it was fitted."""
+"""The result of a fit: a model with its parameters, history and settings."""
 
 import dataclasses
 import math
@@ -30,7 +30,7 @@ from dln_jax.zoo.run import Run, save
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit(Run):
-    """A fitted model of dynamics, with its functions and how it was fitted."""
+    """A fitted model of dynamics, with its functions, history and settings."""
 
     model: Model
     needs: Needs = Needs(joints=("revolute",))  # noqa: RUF009  replaced by every fit
@@ -39,21 +39,21 @@ class Fit(Run):
     """History and stop; its parameters have a leading axis if several seeds were trained."""
     objective: Objective = SCALED_TORQUE
     optimiser: Optimiser | None = None
-    """`None` for a fit without iterations of an optimiser."""
+    """The optimiser; `None` for a direct fit."""
     samples: int | None = None
     """Number of training samples that a network draws; `None` for all."""
     seeds: int | tuple[int, ...] = 0
-    """One seed, or several that trained in one program."""
+    """One seed, or several trained in one program."""
     best: int = 0
-    """Index of the seed that is kept."""
+    """Index of the best seed."""
     cross_validated: bool = False
-    """Whether cross-validation chose it."""
+    """Whether cross-validation chose the seed."""
     search: TreeFit | None = None
     """The search for the joint frames of a learned tree."""
     facts: Any = None
-    """JSON values on how the uncertainty was estimated."""
+    """JSON values that record the estimate of the uncertainty."""
     report: Any = None
-    """The `runs.report.Report` of its evaluation."""
+    """The evaluation, a `runs.report.Report`."""
 
     @property
     def name(self) -> str:
@@ -66,17 +66,17 @@ class Fit(Run):
         return CATALOGUE[self.name].properties
 
     def summed(self, parts: Parts) -> list[int]:
-        """Joints, counted from 1, whose gravity and friction are known only in sum."""
+        """Returns the joints, counted from 1, for which the data determine only the sum of gravity and friction."""
         return summed_with_friction(self.needs, parts.sets.train, network=self.optimiser is not None)
 
     def of_seed(self, index: int) -> Parameters:
-        """Parameters of one of several seeds."""
+        """Returns the parameters of one of several seeds."""
         if isinstance(self.seeds, int):
             return self.training.parameters
         return jax.tree.map(lambda leaf: leaf[index], self.training.parameters)
 
     def save(self, folder: str | Path) -> None:
-        """Writes the model and its uncertainty into a folder, for `dln_jax.load`; replaces a model that is there."""
+        """Writes the model and its uncertainty into a folder for `dln_jax.load`; replaces an existing model."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         save(folder, self.description, self.parameters)
@@ -95,7 +95,7 @@ def direct_fit(
     seconds: float = 0.0,
     search: TreeFit | None = None,
 ) -> Fit:
-    """A fit without iterations, as a training of one step."""
+    """Wraps a direct fit as a one-step training history."""
     model, dtype = build(description), data_type(description["precision"])
     parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), parameters)
     errors = dynamics.validation_errors(model, parts.sets, parameters, objective)
@@ -105,14 +105,14 @@ def direct_fit(
 
 
 def with_uncertainty(fit: Fit, parts: Parts, torque: str, say: Callable[[str], None], *, unit: Any = None) -> Fit:
-    """Adds the uncertainty of the torques; says why if there is none.
+    """Adds the uncertainty of the torques, or reports why the fit has none.
 
     Args:
-        torque: name of the torque that the fit is of.
+        torque: name of the fitted torque, for the report.
         unit: scales of the joints' residuals in the fit, N m or N (default: the spread of the torques).
     """
     if not fit.objective.of_torques:
-        say(f"no uncertainty is stored: a {fit.name} is not fitted to torques alone")
+        say(f"no uncertainty is stored: this {fit.name} was not fitted to torques alone")
         return fit
     if fit.properties.kernel:
         say(f"no uncertainty is stored: a {fit.name} has as many parameters as data")
@@ -128,7 +128,7 @@ def with_uncertainty(fit: Fit, parts: Parts, torque: str, say: Callable[[str], N
             negligible=1e-12 if "tree" in fit.description else 0.0,
         )
     except (InputError, np.linalg.LinAlgError) as error:
-        # The model is trained, so an estimate that its data cannot provide is left out instead of refused.
+        # The model itself is fine, so a failed estimate is reported and left out.
         say(f"no uncertainty is stored: {error}")
         return fit
     say(f"bands are of {torque}, for one more motion of the kind that was recorded")
@@ -137,5 +137,5 @@ def with_uncertainty(fit: Fit, parts: Parts, torque: str, say: Callable[[str], N
 
 
 def double(fit: Fit) -> Model:
-    """The model of a fit in float64."""
+    """Builds the model of a fit in float64."""
     return build({**fit.description, "precision": "f64"})

@@ -2,10 +2,9 @@
 
     tau = Phi(q, qd, qdd) theta + Sᵀ F(S qd, T; shape) c,   over theta, c and shape: `solvers.least_squares`
 
-The nonlinear unknowns are the logarithms of velocities and slopes, log(μ / (1 - μ)) for a load share μ, and the shift
-of a sigmoid and the cooling of viscous friction themselves (`UNKNOWNS`). With load, rows of Phi (at the motors) are
-multiplied by 1 ± μ tanh(u / v) with the sign of tau_link, which comes from the previous fit; fits repeat until no sign
-changes.
+The nonlinear unknowns are the logarithms of velocities and slopes, log(μ / (1 - μ)) for a load share μ, the shift of a
+sigmoid, and the cooling of viscous friction (`UNKNOWNS`). With load, rows of Phi (at the motors) are multiplied by
+1 ± μ tanh(u / v) with the sign of tau_link from the previous fit. Fits repeat until no sign changes.
 """
 
 import functools
@@ -37,53 +36,53 @@ from dln_jax.types import FrictionLaw, InputError, JointVector
 
 FIRST_LOAD = 0.05
 LONGEST_STEP = 1.0
-"""Largest change of an unknown per iteration: a factor e for quantities fitted by their logarithm."""
+"""Largest change of an unknown per iteration; a factor e for logarithms."""
 MOST_ROUNDS = 5
-"""Largest number of fits; the signs of the link torques before the last one are then final."""
+"""Largest number of fits; the last one uses the signs of the link torques from the previous fit."""
 WARMER = 10.0
 """Unit of temperature in the nonlinear unknowns, K."""
 LEAST_WARMTH = 1.0
-"""The effect of temperature is fitted if each joint's temperature has at least this standard deviation, K."""
+"""Smallest standard deviation of each joint's temperature for fitting its effect, K."""
 USUAL_SHAPE = FrictionShape()
 UNKNOWNS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
     "sigmoid_shift": (lambda shift: shift, lambda unknown: unknown),
     "load": (lambda share: np.log(share / (1 - share)), jax.nn.sigmoid),
     "cooling": (lambda cooling: WARMER * cooling, lambda unknown: unknown / WARMER),
 }
-"""Maps of fitted shapes to nonlinear unknowns and back; all others are fitted by their logarithm."""
+"""Maps from fitted shapes to nonlinear unknowns and back; all other shapes use the logarithm."""
 
 
 class Terms(NamedTuple):
-    """What a torque model has beside the links: friction, and motors; for a fit of its coefficients and shapes."""
+    """Terms of a torque model besides the links (friction and motors), for fitting coefficients and shapes."""
 
     laws: tuple[FrictionLaw, ...]
     """As in `mechanics.friction`."""
     shape: FrictionShape = USUAL_SHAPE
     """Initial shapes."""
     held: tuple[str, ...] = ()
-    """Names of shapes that stay at their initial value."""
+    """Names of shapes that keep their initial value."""
     cooling: bool = False
-    """Whether viscous friction depends on the log's temperature; its mean becomes the reference."""
+    """Whether viscous friction depends on temperature; the mean temperature of the log is the reference."""
     motors: Rows | None = None
     """Like `coupled`, as for `make_rigid_tree`."""
     coupled: tuple[Pair, ...] = ()
 
     @property
     def learned(self) -> tuple[str, ...]:
-        """Nonlinear unknowns, by name: entries of `FrictionShape`, "load" and "cooling"."""
+        """Names of the nonlinear unknowns: entries of `FrictionShape`, "load" and "cooling"."""
         shapes = [name for name in shape_of(self.laws) if name not in self.held]
         return (*shapes, *["load"] * ("load" in self.laws), *["cooling"] * self.cooling)
 
 
 class Known(NamedTuple):
-    """What the log and the tree give the equations, in arrays with one row per sample."""
+    """Known quantities in the equations, from the log and the tree; arrays with one row per sample."""
 
     links: Any
     """Phi of links and motors [N, d, 11 d + pairs]."""
     rates: Any
     """Motor rates S qd [N, d]."""
     warmth: Any
-    """Temperature of every motor minus the reference, K [N, d]; zero without cooling."""
+    """Temperature of each motor minus the reference, K [N, d]; zero without cooling."""
     tau: Any
     weights: Any
     """[N, d], scale of the joints' residuals."""
@@ -92,10 +91,10 @@ class Known(NamedTuple):
 
 
 def reference_temperature(data: Trajectories) -> float:
-    """Mean temperature of a log to 0.1 °C; `InputError` if there is none, or that of a joint hardly varies."""
+    """Returns the mean temperature of a log to 0.1 °C; `InputError` if it is missing or hardly varies at a joint."""
     if data.temperature is None:
         raise InputError(
-            "friction is to depend on temperature, which the data do not have; add it (°C), or leave that out"
+            "friction by temperature needs temperatures, but the data have none; add them (°C), or leave the option out"
         )
     deviations = data.temperature.std(axis=0)
     if not deviations.min() >= LEAST_WARMTH:
@@ -111,11 +110,11 @@ def known_of(tree: Tree, data: Trajectories, terms: Terms, *, noise: Any = None)
     """Returns the known quantities of a log, in float64; errors as for `fit_friction`."""
     d = tree.degrees_of_freedom
     bare, (laws, shape, _, cooling, motors, coupled) = tree._replace(armature=np.zeros(d)), terms
-    # A model refuses wrong terms.
+    # The model's factory refuses wrong terms.
     make_rigid_tree(bare, friction=laws, cooling=float(cooling), motors=motors, coupled=coupled, **shape._asdict())
     weights = torque_scale(data) if noise is None else np.broadcast_to(noise, d).astype(float)
     if not (np.isfinite(weights) & (weights > 0)).all():
-        raise InputError(f"noise is {noise}; expected a positive number, or one for each joint")
+        raise InputError(f"noise is {noise}; expected a positive number, or one per joint")
 
     def columns(q: Any, qd: Any, qdd: Any) -> Any:
         links = regressor(bare, q, qd, qdd)[:, : 10 * d]
@@ -137,7 +136,7 @@ def known_of(tree: Tree, data: Trajectories, terms: Terms, *, noise: Any = None)
 
 
 def equations(terms: Terms, unknowns: Any, known: Known) -> tuple[Any, Any]:
-    """Weighted columns [N d, P] and torques [N d] of all terms."""
+    """Returns the weighted columns [N d, P] and torques [N d] of all terms."""
     links, u, warmth, tau, weights, signs = known
     d = u.shape[1]
     shapes = shapes_of(terms, unknowns)
@@ -156,19 +155,19 @@ def equations(terms: Terms, unknowns: Any, known: Known) -> tuple[Any, Any]:
 
 
 def _at_motors(terms: Terms, forces: Any) -> Any:
-    """S⁻ᵀ of forces [N, d, P] at the joints."""
+    """Multiplies forces [N, d, P] at the joints by S⁻ᵀ."""
     return (
         forces if terms.motors is None else jnp.einsum("ji,njp->nip", np.linalg.inv(np.asarray(terms.motors)), forces)
     )
 
 
 def _from_motors(terms: Terms, forces: Any) -> Any:
-    """Sᵀ of forces [N, d, P] at the motors."""
+    """Multiplies forces [N, d, P] at the motors by Sᵀ."""
     return forces if terms.motors is None else jnp.einsum("ji,njp->nip", np.asarray(terms.motors), forces)
 
 
 def solve_terms(terms: Terms, known: Known, design: Callable[..., Any]) -> SeparableSolution:
-    """Fits all unknowns; without nonlinear ones, a dummy without effect takes their place.
+    """Fits all unknowns; a dummy without effect replaces missing nonlinear unknowns.
 
     Args:
         design: `equations` of these terms; solutions with the same function share a compiled program.
@@ -190,7 +189,7 @@ def solve_terms(terms: Terms, known: Known, design: Callable[..., Any]) -> Separ
 
 
 def link_signs(terms: Terms, known: Known, solution: SeparableSolution) -> Any:
-    """Signs of the link torques at the motors, as a fit predicts them."""
+    """Returns the signs of the link torques at the motors that a fit predicts."""
     links = known.links @ solution.linear[: known.links.shape[2]]
     return jnp.sign(_at_motors(terms, links[..., None])[..., 0])
 
@@ -210,18 +209,18 @@ class FrictionFit(NamedTuple):
     """Model with the fitted shapes: `dynamics(fit.model.energies(fit.parameters))`."""
     parameters: RigidTreeParameters
     standard_errors: RigidTreeParameters
-    """Standard error of every parameter, in its unit, within the space that the data determine."""
+    """Standard error of each parameter, in its unit, within the space that the data determine."""
     shape: dict[str, JointVector]
     """Fitted entries of `FrictionShape`, "load", and "cooling" (k, 1/K)."""
     shape_errors: dict[str, JointVector]
     """Standard errors of the entries of `shape`, in their units."""
     keywords: dict[str, Any]
-    """Keywords of `make_rigid_tree` for the model, without its laws: shapes, motors, and with cooling the reference
-    temperature of viscous friction, °C."""
+    """Keywords of `make_rigid_tree` for the model, without friction laws: shapes, motors, and with cooling the
+    reference temperature of viscous friction, °C."""
     torque_mse: float
     """Mean over samples of the sum of squared errors over joints; (N m)² or N²."""
     solution: SeparableSolution
-    """Rank and condition of the linear parameters' columns, and whether the fit converged."""
+    """Rank and condition number of the linear problem, and whether the fit converged."""
 
 
 def fit_friction(
@@ -238,12 +237,12 @@ def fit_friction(
 ) -> FrictionFit:
     """Fits the inertias, armature and friction of a tree to measured torques.
 
-    All samples are held in memory, N d (11 d + coefficients) numbers: decimate long logs.
+    All samples are in memory, N d (11 d + coefficients) numbers, so decimate long logs.
 
     Args:
-        data: samples to fit; hold out the trajectories that will judge the result.
+        data: samples to fit; hold out trajectories for the evaluation.
         laws, shape, held, cooling, motors, coupled: as in `Terms`.
-        noise: standard deviations of the joints' torques [d], which weight the samples (default: the torque's own).
+        noise: torque noise of the joints [d], N m or N, which weights the samples (default: the spread of the torques).
 
     Raises:
         InputError: unknown laws, constant torques, a noise <= 0, or cooling without viscous friction or a temperature.
@@ -252,7 +251,7 @@ def fit_friction(
     with jax.enable_x64(True):
         known = known_of(tree, data, terms, noise=noise)
         solution = solve_terms(terms, known, functools.partial(equations, terms))
-        # Every shape depends on its own unknown alone, so that one derivative holds the slopes of all.
+        # Each shape depends only on its own unknown, so one derivative gives all slopes.
         unknowns = jnp.asarray(solution.nonlinear)
         both = jax.jvp(functools.partial(shapes_of, terms), (unknowns,), (jnp.ones_like(unknowns),))
         fitted, slopes = jax.tree.map(np.asarray, both)

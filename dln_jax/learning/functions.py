@@ -1,12 +1,12 @@
-"""Fits a differential network, or an ensemble of them, to samples of a function and of its derivatives.
+"""Fits a differential network, or an ensemble, to samples of a function and its derivatives.
 
-Type 1 losses read values and Jacobians, type 2 losses only values (the published names); derivative 2 adds the Hessian
-to either. All are means over samples of sums of squares over components, without weights between the terms:
+Type 1 losses use values and Jacobians, type 2 losses only values (the published names). Derivative 2 adds the Hessian
+to either. All losses are means over samples of sums of squares over components, without weights between the terms:
 
     r = [y_hat - y, dy_hat/dx - dy/dx, d²y_hat/dx² - d²y/dx²],   loss = mean over samples of |r|².
 
-The published recipe (Adam with decoupled weight decay, minibatches, constant rate) is for wide networks.
-Levenberg-Marquardt on all samples at once is for small networks, and reduces their errors to the level of the noise.
+The published recipe (Adam with decoupled weight decay, minibatches, constant rate) suits wide networks. For small
+networks, Levenberg-Marquardt on all samples reduces the errors to the level of the noise.
 """
 
 import functools
@@ -65,15 +65,15 @@ class Network(NamedTuple):
     width: int = 128
     depth: int = 1
     members: int = 1
-    """Networks in the ensemble, which differ in their initial parameters."""
+    """Networks in the ensemble; they differ in their initial parameters."""
     precision: str = "f32"
     """f32 or f64; Gauss-Newton needs f64."""
     seed: int = 0
-    """Seed of the initial parameters and of the order of the samples."""
+    """Seed for the initial parameters and the sample order."""
 
 
 Targets = tuple[Array | None, ...]
-"""x, y, dy and d2y of `FunctionSamples`; arrays that the loss does not read are `None` and never computed."""
+"""x, y, dy and d2y of `FunctionSamples`; arrays that the loss does not use are `None` and never computed."""
 
 
 def published_adam(samples: int, *, epochs: int = 500, batch: int = 512, learning_rate: float = 1e-3) -> Adam:
@@ -94,7 +94,7 @@ def published_adam(samples: int, *, epochs: int = 500, batch: int = 512, learnin
 
 
 def targets(data: FunctionSamples, network: Network) -> Targets:
-    """Returns the arrays that the loss reads, on the device.
+    """Returns the arrays that the loss uses, on the device.
 
     Raises:
         InputError: settings are out of range, the data lack a derivative, or the squares of numbers overflow.
@@ -117,7 +117,7 @@ def targets(data: FunctionSamples, network: Network) -> Targets:
 def residual(
     layers: Layers, x: Array, y: Array, dy: Array | None, d2y: Array | None, *, activation: Activation
 ) -> Float[Array, "r"]:
-    """Returns r of one sample: errors of the value, Jacobian and Hessian that have targets, concatenated."""
+    """Returns r of one sample: the concatenated errors of value, Jacobian and Hessian, where targets exist."""
     if d2y is not None:
         predicted = differential_mlp.value_jacobian_and_hessian(layers, x, activation=activation)
     elif dy is not None:
@@ -129,7 +129,7 @@ def residual(
 
 
 def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
-    """Builds an ensemble's problem: the sum of its members' losses, or for Gauss-Newton members as seeds."""
+    """Builds the problem of an ensemble: the sum of the members' losses, or members as seeds for Gauss-Newton."""
     ours, theirs = (targets(data, network) for data in sets)
     sizes = (sets.train.inputs, *(network.width,) * network.depth, sets.train.outputs)
     layers = differential_mlp.init_ensemble(
@@ -142,9 +142,9 @@ def problem(sets: SampleSplit, network: Network, *, together: bool) -> Problem:
     loss = loss_of(members)
 
     def total(layers: Layers, batch: Targets) -> Scalar:
-        """The sum of losses leaves every member's gradient, and so its training, the same as alone."""
+        """Sums the losses, which gives every member the same gradient as alone."""
         if network.members == 1:
-            # An axis of one member would turn all products into batched ones, at two or three times the cost.
+            # An axis of one member would make all products batched, at two or three times the cost.
             return loss(jax.tree.map(lambda leaf: leaf[0], layers), batch)
         return jax.vmap(loss, (0, None))(layers, batch).sum()
 
@@ -165,10 +165,10 @@ def train(
 ) -> Training:
     """Fits the training samples and keeps the parameters with the lowest loss on the validation samples.
 
-    The resulting layers have a leading axis of ensemble members, even if there is only one. With Adam, all members see
-    the same batches and share one best step; Gauss-Newton keeps the best step of every member. Reports and history are
-    means over the members. Devices of a mesh share the members if Gauss-Newton trains several, otherwise the samples.
-    Errors as for `targets` and `fit`.
+    The resulting layers have a leading axis of ensemble members, even for a single one. With Adam, all members see the
+    same batches and share one best step; Gauss-Newton keeps the best step of each member. Reports and history are means
+    over the members. Devices of a mesh split the members if Gauss-Newton trains several, otherwise the samples. Errors
+    as for `targets` and `fit`.
     """
     together = isinstance(optimiser, Adam)
     members = network.members if together else 1
@@ -183,9 +183,9 @@ def train(
 
 
 def grow_width(sets: SampleSplit, network: Network, fit: Callable[[Network], Training]) -> Selection:
-    """Trains networks of `WIDTHS` with `fit` and chooses the smallest that no other beats significantly.
+    """Trains networks of `WIDTHS` with `fit` and chooses the smallest that no other one significantly improves.
 
-    The outcome of a trial is its `Training`. Errors are |r|² of validation samples, means over the ensemble's members.
+    The outcome of a trial is its `Training`. Errors are |r|² of validation samples, averaged over the ensemble.
     """
     held_out = targets(sets.validation, network)
     of_sample = functools.partial(residual, activation=activation(network.activation))

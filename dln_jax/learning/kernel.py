@@ -2,14 +2,14 @@
 
     tau = O L + Phi c + noise,   cov = K + Phi S² Phiᵀ + diag(noise²),   weights = cov⁻¹ tau,   c = S² Phiᵀ weights
 
-O is the Euler-Lagrange operator and K the `torque_covariance` of the samples. Phi is the friction with coefficients c,
-whose prior is normal with deviations S. The joints' noise is the only regulariser. Scales and noises maximise the
-marginal likelihood of the torques on a subset of the samples; the weights solve N d equations (Cholesky).
+O is the Euler-Lagrange operator and K the `torque_covariance` of the samples. Phi c is the friction; the coefficients c
+have a normal prior with deviations S. The joints' noise is the only regulariser. Scales and noise maximise the marginal
+likelihood of the torques on a subset of the samples; the weights solve N d equations (Cholesky).
 
     -log p = ½ tauᵀ cov⁻¹ tau + ½ log det cov + const,   d(-log p) = sum(W dK),   W = (cov⁻¹ - weights weightsᵀ) / 2
 
-L-BFGS minimises -log p. The gradient differentiates no factorisation (Rasmussen and Williams 2006, "Gaussian processes
-for machine learning", eq. 5.9).
+L-BFGS minimises -log p. Its gradient needs no derivative of a factorisation (Rasmussen and Williams 2006, "Gaussian
+processes for machine learning", eq. 5.9).
 """
 
 import functools
@@ -34,35 +34,35 @@ from dln_jax.types import InputError, JointKind, JointSamples, JointVector, Need
 from dln_jax.zoo.descriptions import make
 
 NOISIER = 3.0
-"""The noise is multiplied by this if the covariance is not positive definite to rounding."""
+"""Factor on the noise if the covariance is not numerically positive definite."""
 FIRST_NOISE = 0.05
 """Initial noise, relative to the torques' deviation."""
 FEW = 16
-"""Number of states whose torque variance sets the initial scales."""
+"""Number of states for the torque variance that sets the initial scales."""
 _REFUSED = 1e10
-"""Objective of scales whose covariance is indefinite due to rounding."""
+"""Objective for scales with an indefinite covariance due to rounding."""
 
 
 TorqueEquations = tuple[States, Any, Any]
-"""States of samples, the regressor Phi S [N d, P] of their friction, and their torques [N, d]."""
+"""States of the samples, regressor Phi S [N d, P] of the friction, and torques [N, d]."""
 Unknowns = tuple[KernelScales, Any]
 """Logarithms of the scales and of the noise [d]."""
 
 
 class KernelFit(NamedTuple):
-    """Model of torques, its likelihood and its errors."""
+    """A torque model with its likelihood and errors."""
 
     parameters: Any
     """Parameters of the catalogue's `trigonometric-kernel`, in float64, for `samples` samples."""
     noise: JointVector
-    """Standard deviation of the torque noise in the equations, N m or N, including torque that no such energy explains.
-    It exceeds the most likely value if rounding would otherwise make the covariance indefinite."""
+    """Standard deviation of the torque noise in the equations, N m or N, including unexplained torque. It exceeds the
+    most likely value if rounding would otherwise make the covariance indefinite."""
     likelihood: float
-    """Logarithm of the marginal likelihood per torque, over all fitted samples; higher is better."""
+    """Log marginal likelihood per torque over all fitted samples; higher is better."""
     torque_mse: float
     """Mean over fitted samples of the sum of squared errors over joints; (N m)² or N²."""
     samples: int
-    """Number of samples that the energies are built from."""
+    """Number of samples in the energies."""
     parameter_count: int
     """Number of weights and friction coefficients."""
     seconds: float
@@ -83,15 +83,15 @@ def fit_kernel(
 
     Args:
         needs: kinds of joints, gravity, and friction: viscous friction of the coordinates and joint laws except load.
-        train: samples to fit; hold out those that will judge the result.
-        samples: largest number of samples, evenly spaced; memory is 16 samples² d² bytes, time grows as the cube.
+        train: samples to fit; hold out trajectories for the evaluation.
+        samples: largest number of samples, evenly spaced; memory is 16 samples² d² bytes, and time grows as the cube.
         serial: as for `make_trigonometric_kernel`.
-        likelihood_samples: number of these samples used to fit the scales and the noise.
-        least_noise: lower bound on a joint's noise, relative to its torque's deviation, for data without noise. If it
-            is too low for rounding, it is multiplied by `NOISIER` until it suffices; the result holds the final value.
+        likelihood_samples: number of these samples for fitting the scales and the noise.
+        least_noise: lower bound on a joint's noise, relative to its torque's deviation, for data without noise. It is
+            raised by factors of `NOISIER` if rounding requires it; the result has the final value.
 
     Raises:
-        InputError: constant torques, another number of joints than the data's, friction by load, or a setting <= 0.
+        InputError: constant torques, a different number of joints in the data, friction by load, or a setting <= 0.
     """
     from scipy.linalg import cho_solve
 
@@ -129,9 +129,10 @@ def fit_kernel(
 
 
 def choose_kernel(needs: Needs, train: Trajectories, validation: Trajectories, *, samples: int = 600) -> Selection:
-    """Fits a serial chain and a model without that assumption; returns the better in validation, and both trials.
+    """Fits kernels with and without the assumption of a serial chain; returns the better by validation, and both
+    trials.
 
-    The candidate of a `Trial` is `serial`, its outcome the `KernelFit`; errors are relative to the joints' variances.
+    The candidate of a `Trial` is `serial`, and its outcome a `KernelFit`. Errors are relative to the joints' variances.
     Raises as `fit_kernel`.
     """
     scale = torque_scale(train)
@@ -157,16 +158,16 @@ def _factor(covariance: Float[np.ndarray, "Nd Nd"], noise: JointVector, unit: Jo
         except np.linalg.LinAlgError:
             noise = NOISIER * noise
     raise InputError(
-        f"the covariance of {len(covariance):,} torques is not positive definite to rounding, with any noise that is "
-        "less than the torques; look for samples or numbers that are extreme"
+        f"the covariance of {len(covariance):,} torques is not numerically positive definite, even with noise as large "
+        "as the torques; look for extreme samples or numbers"
     )
 
 
 def _friction(needs: Needs, qd: JointSamples) -> Float[np.ndarray, "N d P"]:
-    """Torques of one unit of every friction coefficient."""
+    """Returns the torques per unit of each friction coefficient."""
     d = needs.degrees_of_freedom
     if "load" in needs.joint_friction:
-        raise InputError("friction by load multiplies what the energies give; leave load out, or train a network")
+        raise InputError("friction by load is not linear in this model; leave load out, or train a network")
     lever = np.eye(d) if needs.joint_map is None else np.asarray(needs.joint_map).T
     shape = FrictionShape(velocity_scale=needs.velocity_scale)
     rates = jnp.asarray(qd @ lever)
@@ -220,7 +221,7 @@ def _likeliest(
 
 
 def likelihood(joints: tuple[JointKind, ...], serial: bool) -> Callable[[Unknowns, TorqueEquations], Any]:
-    """(unknowns, equations) -> minus the log likelihood per torque, without the constant, and its gradient."""
+    """Returns (unknowns, equations) -> minus the log likelihood per torque, without the constant, and its gradient."""
 
     def evaluate(unknowns: Unknowns, equations: TorqueEquations) -> Any:
         states, friction, tau = equations
@@ -245,9 +246,9 @@ def likelihood(joints: tuple[JointKind, ...], serial: bool) -> Callable[[Unknown
 
 
 def start_of(needs: Needs, serial: bool, equations: TorqueEquations, unit: np.ndarray) -> KernelScales:
-    """Returns logarithms of scales that make the energies explain torques of the measured size, with random frames.
+    """Returns logarithms of scales for which energies with random frames predict torques of the measured size.
 
-    A randomly rotated vector keeps on average a third of its squared length along the joint's axis.
+    On average, a randomly rotated vector keeps a third of its squared length along the joint's axis.
     """
     (states, *_), d = equations, needs.degrees_of_freedom
     ones = np.ones(d if serial else 1)
@@ -260,7 +261,7 @@ def start_of(needs: Needs, serial: bool, equations: TorqueEquations, unit: np.nd
     few = tuple(array[:: max(1, len(array) // FEW)] for array in states)
 
     def size(scales: KernelScales) -> float:
-        """Mean variance of torques in units of the measured ones; 1 if nothing moves."""
+        """Returns the mean variance of torques relative to the measured torques; 1 if nothing moves."""
         variance = np.diagonal(compiled_covariance(needs.joints, serial)(scales, few)).reshape(-1, d)
         return float(np.mean(variance / unit**2)) or 1.0
 
@@ -272,5 +273,5 @@ def start_of(needs: Needs, serial: bool, equations: TorqueEquations, unit: np.nd
 
 @functools.lru_cache(maxsize=4)
 def compiled_covariance(joints: tuple[JointKind, ...], serial: bool) -> Callable[..., Any]:
-    """(scales, states) -> `torque_covariance`."""
+    """Returns the compiled (scales, states) -> `torque_covariance`."""
     return compiled(functools.partial(torque_covariance, joints, serial))

@@ -1,12 +1,12 @@
-"""Fits models whose forces are linear in their parameters: one least-squares problem, no iteration.
+"""Fits models that are linear in their parameters by one least-squares problem, without iteration.
 
     tau = Phi(q, qd, qdd) theta,   theta minimises sum over samples of |(Phi theta - tau) / torque_scale|²
 
-This works for any `Model` of that kind, such as `models.trigonometric`. Phi is the derivative of the inverse model with
-respect to the parameters, exact because the model is linear in them.
+This works for any `Model` with linear parameters, such as `models.trigonometric`. Phi is the derivative of the inverse
+model with respect to the parameters, which is exact for a linear model.
 
-`choose_degrees` selects the size of a trigonometric basis. One degree for all joints grows until it no longer helps
-(`learning.select`). If that degree exceeds 1, every joint in turn takes the smallest degree that is not
+`choose_degrees` selects the size of a trigonometric basis. A common degree for all joints grows until it no longer
+helps (`learning.select`). If that degree exceeds 1, each joint in turn takes the smallest degree that is not
 significantly worse. A joint that neither changes the mass matrix nor lifts a weight, such as an arm's first vertical
 axis, ends at degree 0, which divides the size of the basis by 2 n + 1.
 """
@@ -35,28 +35,26 @@ from dln_jax.zoo.descriptions import make
 
 LARGEST_DEGREE = 4
 MOST_PARAMETERS = 1_500
-"""Largest basis that is tried; a fit takes about N d P² operations."""
+"""Largest number of parameters of a basis; a fit takes about N d P² operations."""
 ROUNDING = 1e-10
 """Bases with a smaller error, relative to the torque, count as equally good."""
-# The model's force may differ from Phi theta by the rounding of its sum, relative to the sum of absolute terms.
+# Largest rounding difference between the model's force and Phi theta, relative to the sum of absolute terms.
 _LINEARITY_TOLERANCE = 1e-9
-_NOT_LINEAR = (
-    "the model's torque is not linear in its parameters, as a linear fit expects: "
-    "take make_trigonometric, or train this model by its residuals"
-)
+_NOT_LINEAR = "the model's torque is not linear in its parameters; use make_trigonometric, or train this model with fit"
 
 
 class LinearFit(NamedTuple):
-    """Identified parameters, and how well the data determine them."""
+    """Identified parameters, with rank, condition and error of the fit."""
 
     parameters: Any
     """Parameters of the model, in its dtype."""
     parameter_count: int
     """P, the number of parameters."""
     rank: int
-    """Number of combinations of parameters that the data determine; the solution is zero in the other P - rank."""
+    """Number of parameter combinations that the data determine; the solution is zero in the other P - rank."""
     condition: float
-    """Condition number of the scaled columns that count: the largest amplification of relative errors of the data."""
+    """Condition number of the scaled columns within the rank: the largest amplification of relative errors in the
+    data."""
     torque_mse: float
     """Mean over the fitted samples of the sum of squared errors over joints, in float64; (N m)² or N²."""
     seconds: float
@@ -72,21 +70,21 @@ def fit_linear(
     negligible: float = 0.0,
     chunk_size: int = 4096,
 ) -> LinearFit:
-    """Fits the parameters that minimise the torque error on the data, in float64 whatever the model's dtype.
+    """Fits the parameters that minimise the torque error on the data; computes in float64 for any dtype of the model.
 
-    It takes about N d P² operations. If data leave combinations of parameters undetermined, the result is the shortest
-    solution (see `solvers.least_squares`), which predicts the same forces along motions like those of the data.
+    The fit takes about N d P² operations. If the data leave combinations of parameters undetermined, the result is the
+    shortest solution (see `solvers.least_squares`), which predicts the same forces for similar motions.
 
     Args:
         model: linear in its parameters.
-        data: trajectories to fit; hold out those that will judge the result.
+        data: trajectories to fit; hold out trajectories for the evaluation.
         ridge: dimensionless, as in `solvers.least_squares.solve`.
-        rank_tolerance: as in `solvers.least_squares.solve`; by default rounding alone.
-        negligible: as in `solvers.least_squares.solve`; 1e-12 for rigid trees, some of whose columns are rounding.
-        chunk_size: samples whose design matrix is in memory at a time.
+        rank_tolerance: as in `solvers.least_squares.solve` (default: rounding).
+        negligible: as in `solvers.least_squares.solve`; 1e-12 for rigid trees, where some columns are rounding.
+        chunk_size: number of samples per chunk of the design matrix in memory.
 
     Raises:
-        InputError: the model is not linear in its parameters, the torques do not vary, or a setting is out of range.
+        InputError: the model is not linear in its parameters, the torques are constant, or a setting is out of range.
     """
     require_positive(chunk_size=chunk_size)
     start = time.perf_counter()
@@ -108,7 +106,7 @@ def fit_linear(
             for columns, predicted, tau in design_chunks(linearise, parameters, data, chunk_size)
         )
         errors, rounding = map(np.concatenate, zip(*parts, strict=True))
-        # A force that is homogeneous in its parameters passes the test per sample; only its total residual differs.
+        # A nonlinear but homogeneous force passes the test per sample; only its total residual differs.
         if not abs(np.linalg.norm(errors / scale) - solution.residual) <= np.linalg.norm(rounding / scale):
             raise InputError(_NOT_LINEAR)
     return LinearFit(
@@ -123,13 +121,13 @@ def fit_linear(
 
 @functools.lru_cache(maxsize=4)
 def design(model: Model) -> Callable:
-    """(parameters, q, qd, qdd as [N, d]) -> Phi [N, d, P] and tau [N, d]: `linearised`, compiled."""
+    """Returns the compiled (parameters, q, qd, qdd as [N, d]) -> Phi [N, d, P] and tau [N, d]."""
     one = functools.partial(linearised, model)
     return compiled(jax.vmap(one, in_axes=(None, 0, 0, 0)))
 
 
 def require_linear(columns: np.ndarray, theta: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """Returns the bound on the rounding between Phi theta and the force; raises `InputError` if they differ by more."""
+    """Returns the rounding bound between Phi theta and the force; `InputError` if they differ by more."""
     rounding = _LINEARITY_TOLERANCE * (abs(columns) @ abs(theta))
     if not (abs(columns @ theta - predicted) <= rounding).all():
         raise InputError(_NOT_LINEAR)
@@ -137,12 +135,12 @@ def require_linear(columns: np.ndarray, theta: np.ndarray, predicted: np.ndarray
 
 
 def shapes_of(model: Model) -> Parameters:
-    """The parameters of a model as shapes and dtypes."""
+    """Returns the shapes and dtypes of a model's parameters."""
     return jax.eval_shape(model.init, jax.random.key(0))
 
 
 def unravelled(vector: np.ndarray | Array, like: Parameters) -> Parameters:
-    """Returns a tree like another from a vector, in the order of its leaves; nothing is compiled."""
+    """Converts a vector to a tree like another, in the order of its leaves, without compilation."""
     leaves, structure = jax.tree.flatten(like)
     ends = np.cumsum([leaf.size for leaf in leaves])
     parts = (vector[end - leaf.size : end].reshape(leaf.shape) for leaf, end in zip(leaves, ends, strict=True))
@@ -150,14 +148,14 @@ def unravelled(vector: np.ndarray | Array, like: Parameters) -> Parameters:
 
 
 def parameters_of(vector: np.ndarray, like: Parameters) -> Parameters:
-    """Parameters of a model from a vector, in the dtypes of others."""
+    """Converts a vector to parameters with the structure and dtypes of others."""
     return jax.tree.map(lambda leaf, other: jnp.asarray(leaf, other.dtype), unravelled(vector, like), like)
 
 
 def design_chunks(
     linearise: Callable, parameters: Parameters, data: Trajectories, chunk_size: int, *, even: bool = True
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yields Phi [n, d, P], the model's tau and the measured tau [n, d] of n <= chunk_size samples at a time.
+    """Yields Phi [n, d, P], the model's tau and the measured tau [n, d] for chunks of n <= chunk_size samples.
 
     Even chunks waste no work; chunks of exactly `chunk_size` samples share one program for any number of samples.
     """
@@ -172,7 +170,7 @@ def design_chunks(
 
 
 def weighted(chunks: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]], unit: JointVector) -> Rows:
-    """Yields rows [n d, P] and right-hand sides [n d] of `design_chunks`, in units of the joints."""
+    """Yields rows [n d, P] and right-hand sides [n d] from `design_chunks`, in units of the joints."""
     for columns, _, tau in chunks:
         yield (columns / unit[:, None]).reshape(-1, columns.shape[2]), (tau / unit).ravel()
 
@@ -180,9 +178,9 @@ def weighted(chunks: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]], unit: 
 def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) -> Selection:
     """Chooses the degree of every joint; returns the chosen trial and all trials.
 
-    The candidate of a `Trial` is the degrees, and the outcome is the `LinearFit` in float64. Its errors are squared
-    torque errors of the validation samples in units of the joints' `torque_scale`, summed over joints. Degrees above 1
-    are tried while they have at most `MOST_PARAMETERS` parameters, and no more than the training data have equations.
+    The candidate of a `Trial` is the degrees, and its outcome the `LinearFit` in float64. Its errors are squared torque
+    errors of the validation samples in units of the joints' `torque_scale`, summed over joints. Degrees above 1 have at
+    most `MOST_PARAMETERS` parameters, and no more parameters than the training data have equations.
 
     Raises:
         InputError: the basis of degree 1 is too large, or `fit_linear` refuses the data.
@@ -215,7 +213,7 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
 
 
 def parameters_of_degree(needs: Needs, degree: int) -> int | None:
-    """Number of parameters of the trigonometric model with this degree in every joint; `None` if it is too large."""
+    """Counts the parameters of the trigonometric model with this degree in every joint; `None` if too many."""
     try:
         model = make("trigonometric", needs, degree=degree)
     except InputError:

@@ -3,13 +3,13 @@
     loss = mean over samples and components of |rates(q, p) - (qd, pd)|²           (phase fields)
     residual = (qdd_hat(q, qd, tau) - qdd) / spread of qdd                         (accelerations)
 
-The first is the published loss of Hamiltonian networks (Greydanus, Dzamba and Yosinski 2019). It is minimised by
-Gauss-Newton, Adam, or, for a field that is linear in its parameters, by one least-squares problem. The validation
-trajectories, drawn from those for training, select the parameters; no test data are read. If states are noisy and rates
-are not, the loss has a bias that more data do not remove: it flattens the field (regression dilution).
+The first is the published loss of Hamiltonian networks (Greydanus, Dzamba and Yosinski 2019). Gauss-Newton or Adam
+minimise it, or one least-squares problem for a field that is linear in its parameters. Validation trajectories, drawn
+from the training set, select the parameters; no test data are used. If states are noisy and rates are not, the loss has
+a bias that more data do not remove: it flattens the field (regression dilution).
 
-The second works with or without torques. Where accelerations are exact, this fit alone is enough; otherwise it is the
-first fit for `learning.shooting`, whose result does not depend on estimated derivatives.
+The second works with or without torques. This fit is enough for exact accelerations. Otherwise it is the first fit for
+`learning.shooting`, which does not depend on estimated derivatives.
 """
 
 import functools
@@ -37,7 +37,7 @@ PHASE = ("q", "p", "qd", "pd")
 
 
 def rate_residual(model: Model, parameters: Parameters, q: Array, p: Array, qd: Array, pd: Array) -> Array:
-    """(rates - (qd, pd)) / sqrt(2 d) of one sample [2 d]; the sum of its squares is the sample's part of the loss."""
+    """Returns (rates - (qd, pd)) / sqrt(2 d) of one sample [2 d]; its sum of squares is the sample's loss."""
     velocity, force = flow(model.energies(parameters)).rates(q, p)
     return jnp.concatenate([velocity - qd, force - pd]) / math.sqrt(2 * q.shape[0])
 
@@ -50,12 +50,12 @@ def rates_problem(
     Args:
         model: a phase model.
         train: trajectories with p and pd.
-        validation: trajectories that select the parameters, with p and pd; `data.splits.hold_out` draws some.
-        seed: seed of the initial parameters, of the drawn samples, and of their order.
-        most_samples: largest number of samples to fit, and to validate; larger sets are subsampled at random.
+        validation: trajectories that select the parameters, with p and pd, for example from `data.splits.hold_out`.
+        seed: seed for the initial parameters, the drawn samples and their order.
+        most_samples: largest number of samples for training and for validation; larger sets are drawn at random.
 
     Raises:
-        InputError: no p or pd in the data, numbers whose squares overflow, or settings out of range.
+        InputError: p or pd is missing, squares overflow, or a setting is out of range.
     """
     require_positive(most_samples=most_samples)
     require_seed(seed)
@@ -73,12 +73,12 @@ def rates_problem(
 def match_linear(
     model: Model, data: Trajectories, *, validation: Trajectories | None = None
 ) -> tuple[Training, SampleVector]:
-    """Fits a field that is linear in its parameters by least squares, in float64, and returns the validation errors.
+    """Fits a field that is linear in its parameters by least squares, in float64; also returns the validation errors.
 
-    The errors are the squared errors of the validation samples, or of the fitted ones without a validation.
+    These are squared errors of the validation samples, or of the training samples without validation.
 
     Raises:
-        InputError: no p or pd in the data, or numbers that are not finite or whose squares are not.
+        InputError: p or pd is missing, or numbers or their squares are not finite.
     """
     began = time.perf_counter()
     with jax.enable_x64(True):
@@ -110,14 +110,14 @@ def accelerations_problem(
     """Builds the problem of fitting a model to accelerations, in float64.
 
     Args:
-        model: built from any energies, or from accelerations, with float64 parameters.
-        data: training samples; if there are more than `most_samples`, a random subset is drawn.
+        model: any model of energies or accelerations, with float64 parameters.
+        data: training samples; at most `most_samples` of them are drawn at random.
         validation: samples that select the parameters.
         gauge: fixes the scale of the energies; needed only for motions without torques.
-        seed: seed of the draw and of the order of the samples.
+        seed: seed for the draw and the sample order.
 
     Raises:
-        InputError: the data have no torques and there is no gauge, or numbers are too large.
+        InputError: both torques and gauge are missing, or numbers are too large.
     """
     require_positive(most_samples=most_samples)
     check_gauge(gauge, data.tau, data.degrees_of_freedom)

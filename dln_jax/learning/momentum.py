@@ -1,15 +1,14 @@
-"""Fits models to q, qd and torques by the equations of motion in weak form, without accelerations.
+"""Fits models to q, qd and torques by the weak form of the equations of motion, without accelerations.
 
-With the momentum p = M(q) qd, tau = dp/dt + s(q, qd), where s = tau(q, qd, 0) - dM/dt qd holds gravity, friction and
-the rest of the Coriolis forces. Multiplied by a window w(t) that is zero at both ends, and integrated by parts:
+With the momentum p = M(q) qd, tau = dp/dt + s(q, qd), where s = tau(q, qd, 0) - dM/dt qd has gravity, friction and the
+rest of the Coriolis forces. Multiply by a window w(t) that is zero at both ends, and integrate by parts:
 
     - integral w' p dt + integral w s dt = integral w tau dt
 
-(modulating functions, Shinbrot 1957; for robots the filtered forms of Slotine and Li 1987.) Accelerations, whose noise
-grows with the square of the frequency, do not appear. Both sides pass through the same low-pass, so that dry friction
-is not distorted, and the result hardly depends on the cut-off of q. Torques that are held between samples are no harder
-to fit than smooth ones. The windows are sin⁴ (pi t / W); plain sums over their samples are as accurate as the motion is
-smooth.
+(modulating functions, Shinbrot 1957; for robots the filtered forms of Slotine and Li 1987.) There are no accelerations,
+which have noise that grows with the square of the frequency. Both sides pass through the same low-pass, so dry friction
+is not distorted, and the result hardly depends on the cut-off of q. Torques held between samples fit as well as smooth
+ones. The windows are sin⁴ (pi t / W); sums over their samples are accurate for smooth motions.
 
 `fit_momentum` fits any model that is linear in its parameters: one equation per joint and window. `momentum_errors` are
 the residuals of any other model, and `acceleration_misfit` compares models of one plant.
@@ -41,17 +40,17 @@ from dln_jax.solvers.normal_equations import count
 from dln_jax.types import InputError, JointVector, Vector, require_positive
 
 WINDOW = 0.16
-"""Length of a window in s: about two periods of the highest frequency that a low-pass at 12 Hz passes."""
+"""Length of a window in s: about two periods of a low-pass at 12 Hz."""
 FEWEST = 8
 """Smallest number of steps of a window."""
 OVERLAP = 5
-"""Number of windows that start within the length of one; more would be nearly redundant."""
+"""Number of windows that start within one window length; more would be nearly redundant."""
 CHUNK = 4096
-"""Samples whose columns are in memory at a time."""
+"""Number of samples per chunk of columns in memory."""
 ROUNDS = 10
 """Largest number of reweighted fits; three to five are usual."""
 SETTLED = 0.01
-"""Relative change of the errors' covariance that ends them."""
+"""Relative change of the error covariance that ends the reweighting."""
 
 
 class MomentumWindows(NamedTuple):
@@ -74,35 +73,38 @@ def fit_momentum(
     reweighted: bool = False,
     **tolerances: Any,
 ) -> tuple[Any, Float[np.ndarray, "W d"], LeastSquaresSolution]:
-    """Fits the momenta of windows by least squares, in float64; qdd is not read.
+    """Fits the momenta of windows by least squares, in float64, without qdd.
 
-    Returns the parameters in the model's dtype, the error of every window's mean torques in N m or N, and the solution
-    with its rank and condition.
+    Returns the parameters in the model's dtype, the error of the mean torques of each window in N m or N, and the
+    solution with its rank and condition number.
 
     Args:
-        model: linear in its parameters, such as `make_rigid_tree` and `make_trigonometric`.
-        data: at equal time steps, with smooth velocities and measured torques, such as from `smooth`.
+        model: linear in its parameters, such as `make_rigid_tree` and
+            `make_trigonometric`.
+        data: samples at equal time steps, with smooth velocities and measured torques, from
+            `data.encoders.smoothing.smooth`.
         window: length in s, at least `FEWEST` steps.
-        noise: deviations of the torques' noise that divide the equations (default: those of the torques themselves).
+        noise: standard deviation of the torque noise of each joint, which divides the equations (default: of the
+            torques).
         reweighted: weight the equations by the covariance of their own errors until it settles (iterated generalised
-            least squares, Zellner 1962). Noise of encoders enters the equations of all joints through the mass matrix.
-            Without its correlations, equations without a motor, which zero parameters satisfy, pull those of a plant
-            with weak motors towards zero.
+            least squares, Zellner 1962). Encoder noise enters the equations of all joints through the mass matrix.
+            Without its correlations, the equations of joints without a motor, which zero parameters satisfy, pull the
+            parameters of a plant with weak motors towards zero.
         tolerances: ridge, rank_tolerance and negligible of `solvers.least_squares.solve`.
 
     Raises:
-        InputError: unequal steps, no segment as long as a window, torques that do not vary, or settings out of range.
+        InputError: unequal steps, segments shorter than a window, constant torques, or settings out of range.
     """
     require_positive(window=window)
     d, like = data.degrees_of_freedom, shapes_of(model)
     with jax.enable_x64(True):
         scale = torque_scale(data) if noise is None else np.asarray(noise, float)
         if scale.shape != (d,) or not (scale > 0).all():
-            raise InputError(f"noise is {scale}; expected a positive number for each of {d} joints")
+            raise InputError(f"noise is {scale}; expected {d} positive numbers, one per joint")
         equations = list(_equations(functools.partial(_columns(model), np.zeros(count(like))), data, window))
 
     def solve(factor: np.ndarray) -> tuple[LeastSquaresSolution, np.ndarray]:
-        """Solution and errors [W, d] of equations whose errors have the covariance factor factorᵀ."""
+        """Returns solution and errors [W, d] for errors with the covariance factor factorᵀ."""
         weighted = (
             (np.linalg.solve(factor, A).reshape(b.size, -1), np.linalg.solve(factor, b[..., None]).ravel())
             for A, b in equations
@@ -126,13 +128,13 @@ def fit_momentum(
 
 
 def momentum_and_rest(plant: Dynamics, q: Vector, qd: Vector) -> tuple[Vector, Vector]:
-    """p = M qd and s = tau(q, qd, 0) - dM/dt qd of one state: tau = dp/dt + s."""
+    """Returns p = M qd and s = tau(q, qd, 0) - dM/dt qd of one state, so that tau = dp/dt + s."""
     p, change = jax.jvp(lambda place: plant.mass_matrix(place) @ qd, (q,), (qd,))
     return p, plant.inverse_dynamics(q, qd, jnp.zeros_like(qd)) - change
 
 
 def window_weights(steps: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """w dt and w' dt [steps + 1] of a window of this number of steps, scaled so that the integral of w is 1."""
+    """Returns w dt and w' dt [steps + 1] of a window with this number of steps; the integral of w is 1."""
     phase = np.pi * np.arange(steps + 1) / steps
     w, slope = np.sin(phase) ** 4, 4 * np.pi / (steps * dt) * np.sin(phase) ** 3 * np.cos(phase)
     return w / w.sum(), slope / w.sum()
@@ -140,7 +142,7 @@ def window_weights(steps: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
 
 @functools.lru_cache(maxsize=4)
 def _columns(model: Model) -> Callable[..., Array]:
-    """(theta [P], q, qd as [N, d]) -> derivatives [N, 2 d, P] of momentum and rest by theta, compiled."""
+    """Returns the compiled (theta [P], q, qd as [N, d]) -> derivatives [N, 2 d, P] of p and s by theta."""
     like = shapes_of(model)
 
     def both(theta: Array, q: Vector, qd: Vector) -> Array:
@@ -150,10 +152,10 @@ def _columns(model: Model) -> Callable[..., Array]:
 
 
 def _cut(data: Trajectories, window: float) -> tuple[list[Int[np.ndarray, "W S+1"]], float]:
-    """Samples of overlapping windows in every gapless segment that is long enough, and their time step.
+    """Returns the samples of overlapping windows in all segments that are long enough, and their time step.
 
     Raises:
-        InputError: unequal steps, or no segment is long enough.
+        InputError: unequal steps, or all segments are too short.
     """
     pieces = segments(data.t, data.trajectory)
     dt = float(np.median(np.concatenate([np.diff(data.t[piece]) for piece in pieces])))
@@ -161,7 +163,9 @@ def _cut(data: Trajectories, window: float) -> tuple[list[Int[np.ndarray, "W S+1
     for piece in pieces:
         late = np.abs(data.t[piece] - data.t[piece[0]] - dt * np.arange(len(piece)))
         if len(piece) > FEWEST and late.max() > 10 * EVEN * dt * len(piece):
-            raise InputError("steps in time are not equal, as windows take them; resample with data.encoders.smooth")
+            raise InputError(
+                "windows need equal time steps, but the steps vary; resample with data.encoders.smoothing.smooth"
+            )
     windows = [np.lib.stride_tricks.sliding_window_view(piece, steps + 1) for piece in pieces if len(piece) > steps]
     if not windows:
         raise InputError(f"no segment of the data is as long as a window of {window:g} s; give a shorter one")
@@ -169,7 +173,7 @@ def _cut(data: Trajectories, window: float) -> tuple[list[Int[np.ndarray, "W S+1
 
 
 def _equations(program: Callable[..., Array], data: Trajectories, window: float) -> Rows:
-    """Columns [W, d, P] and right-hand sides [W, d] of windows, one chunk after the other."""
+    """Yields the columns [W, d, P] and right-hand sides [W, d] of windows in chunks."""
     pieces, dt = _cut(data, window)
     steps, d = pieces[0].shape[1] - 1, data.degrees_of_freedom
     w, slope = window_weights(steps, dt)
@@ -178,7 +182,7 @@ def _equations(program: Callable[..., Array], data: Trajectories, window: float)
     for piece in pieces:
         for rows in (piece[first : first + together] for first in range(0, len(piece), together)):
             first, last = rows[0, 0], rows[-1, -1]
-            # All chunks have the same length, so that one program serves them; the last ones repeat a sample.
+            # One program serves all chunks, since they have the same length; the last ones repeat a sample.
             samples = np.minimum(first + np.arange((together - 1) * apart + steps + 1), last)
             values = np.asarray(program(data.q[samples], data.qd[samples]))
             columns = [
@@ -197,21 +201,22 @@ def cut_momentum_windows(data: Trajectories) -> MomentumWindows:
 
 
 def momentum_errors(plant: Dynamics, q: Array, qd: Array, impulse: Array, *, dt: float) -> Array:
-    """Residual of one window's equations [d], in N m or N."""
+    """Returns the residual [d] of one window's equations, N m or N."""
     w, slope = map(jnp.asarray, window_weights(q.shape[0] - 1, dt))
     p, rest = jax.vmap(lambda q, qd: momentum_and_rest(plant, q, qd))(q, qd)
     return w @ rest - slope @ p - impulse
 
 
 def window_errors(plant: Dynamics, windows: MomentumWindows) -> Float[Array, "W d"]:
-    """Residuals of the equations of all windows, N m or N."""
+    """Returns the residuals of the equations of all windows, N m or N."""
     return jax.vmap(lambda *window: momentum_errors(plant, *window, dt=windows.dt))(*map(jnp.asarray, windows[:3]))
 
 
 def acceleration_misfit(plant: Dynamics, windows: MomentumWindows) -> Array:
-    """Half the log determinant of the covariance of acceleration errors: residuals divided by M in a window's middle.
+    """Returns half the log determinant of the covariance of acceleration errors (residuals divided by M at mid-window).
 
-    It compares models of one plant. Residuals alone favour models with small parameters if a joint has no motor.
+    The number compares models of one plant. Residuals alone favour models with small parameters if a joint has no
+    motor.
     """
     masses = jax.vmap(plant.mass_matrix)(jnp.asarray(windows.q[:, windows.q.shape[1] // 2]))
     errors = jnp.linalg.solve(masses, window_errors(plant, windows)[..., None])[..., 0]

@@ -1,4 +1,4 @@
-"""Objectives of training: the arrays that they read, the scales of their residuals, and the residuals of a sample."""
+"""Training objectives: their arrays, residuals, and the scales of the residuals."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -22,31 +22,31 @@ class Objective(NamedTuple):
     """Objective of a fit of dynamics."""
 
     keys: tuple[str, ...]
-    """Arrays [N, d] of `Trajectories` that the residual reads."""
+    """Arrays [N, d] of `Trajectories` in the residual."""
     scale: Callable[[Trajectories], np.ndarray]
-    """Training data -> the scales of the residuals. Raises InputError if the data cannot determine the model."""
+    """Training data -> scales of the residuals; `InputError` if the data cannot determine the model."""
     residual: Callable[..., Float[Array, " r"]]
     """(system, *sample) -> residuals of one sample, in SI units."""
     selects_by: str
-    """"torque": validation is the mean square of the residual in (N m)², as published, to which large joints contribute
-    most; "scaled": in units of the scales, so that all joints count alike."""
+    """"torque": validate by the mean square of the residual in (N m)², as published; large joints dominate. "scaled":
+    validate in units of the scales, so that all joints have equal weight."""
 
     @property
     def of_torques(self) -> bool:
-        """Whether its residuals are torque errors and nothing else."""
+        """Whether all residuals are torque errors."""
         return self.residual is TORQUE.residual
 
 
 def torque_scale(data: Trajectories) -> JointVector:
-    """Standard deviations of the torques [d], in N m or N: the scales of the residuals.
+    """Returns the standard deviations of the torques [d], N m or N, as scales of the residuals.
 
-    A channel that does not vary (a joint without a motor) is scaled by the root mean square of those that do.
+    A constant channel (a joint without a motor) takes the root mean square of the others.
 
     Raises:
-        InputError: no torque varies, so any multiple of a Lagrangian fits; or squares are infinite or zero.
+        InputError: all torques are constant, so any multiple of a Lagrangian fits; or squares are infinite or zero.
     """
     message = (
-        "tau is constant in every training sample: motion without varying torque fits any multiple of an energy; "
+        "tau is constant in all training samples, so any multiple of an energy fits; "
         "add trajectories that are driven by known, varying torques"
     )
     return _scale("tau", data.tau, message)
@@ -66,7 +66,7 @@ SCALED_TORQUE = TORQUE._replace(selects_by="scaled")
 
 def _canonical_scale(data: Trajectories) -> np.ndarray:
     torque_scale(data)
-    still = "is constant in every training sample: nothing moves, and no Hamiltonian can be told from another"
+    still = "is constant in all training samples: nothing moves, so the data do not determine a Hamiltonian"
     return np.concatenate([_scale(key, getattr(data, key), f"{key} {still}") for key in ("qd", "qdd")])
 
 
@@ -87,7 +87,7 @@ with a mean square error of 8e-6 (N m)², while q, qd, qdd and tau are consisten
 
 
 def _both_scales(data: Trajectories) -> np.ndarray:
-    still = "qdd is constant in every training sample; add trajectories that accelerate"
+    still = "qdd is constant in all training samples; add trajectories with acceleration"
     return np.concatenate([torque_scale(data), _scale("qdd", data.qdd, still)])
 
 
@@ -101,26 +101,28 @@ BOTH_WAYS = SCALED_TORQUE._replace(
     scale=_both_scales,
     residual=lambda *sample: jnp.concatenate([TORQUE.residual(*sample), FORWARD.residual(*sample)]),
 )
-"""[tau_hat - tau, qdd_hat - qdd], in units of their standard deviations in the training samples: the loss of Lutter
-and Peters (2021, arXiv:2110.01894). It also serves models whose inverse and forward sides are different networks."""
+"""[tau_hat - tau, qdd_hat - qdd] in units of their standard deviations in the training samples: the loss of Lutter and
+Peters (2021, arXiv:2110.01894). It also suits models with separate inverse and forward networks."""
 
 STATED = {"inverse": TORQUE, "forward": FORWARD, "both": BOTH_WAYS}
-"""Objectives that a user may select by name."""
+"""Objectives by name, for users."""
 
 
 def objective_of(name: str, data: Trajectories, stated: str | None = None, *, torque: Objective = TORQUE) -> Objective:
-    """Returns the objective of a model of the catalogue; a Hamiltonian needs momenta, and otherwise fits torques.
+    """Returns the objective of a catalogue model; a Hamiltonian without momenta in the data fits torques.
 
     Args:
         stated: name from `STATED` that overrides the model's own objective.
-        torque: takes the place of `TORQUE`.
+        torque: replaces `TORQUE`.
 
     Raises:
-        InputError: only one side is selected for a model without an energy, whose other side would not be trained.
+        InputError: a single side is selected for a model without an energy, which would leave the other side untrained.
     """
     properties = CATALOGUE[name].properties
     if stated not in (None, "both") and not properties.energy:
-        raise InputError(f"a {name} model has no energy, so both of its sides are trained; leave --objective out")
+        raise InputError(
+            f"a {name} model has no energy, so inverse and forward side both need training; leave --objective out"
+        )
     own = CANONICAL if properties.canonical else TORQUE if properties.energy else BOTH_WAYS
     complete = all(getattr(data, key) is not None for key in own.keys)
     objective = STATED[stated] if stated is not None else own if complete else TORQUE
@@ -128,12 +130,12 @@ def objective_of(name: str, data: Trajectories, stated: str | None = None, *, to
 
 
 def residuals(objective: Objective, system: System, batch: tuple[Array, ...]) -> Float[Array, "N r"]:
-    """Residuals of a batch, in SI units."""
+    """Returns the residuals of a batch, in SI units."""
     return vmap(lambda *sample: objective.residual(system, *sample))(*batch)
 
 
 def squared_torque_errors(model: Model, parameters: Parameters, data: Trajectories, scale: JointVector) -> JointSamples:
-    """Squared torque error of every sample and joint, computed in float64, in units of the squared scale."""
+    """Returns the squared torque error of each sample and joint in units of the squared scale, computed in float64."""
     with jax.enable_x64(True):
         judge = jax.jit(lambda theta, batch: residuals(TORQUE, model.energies(theta), batch))
         errors = np.asarray(judge(parameters, arrays_of(data, TORQUE.keys)))
@@ -141,9 +143,9 @@ def squared_torque_errors(model: Model, parameters: Parameters, data: Trajectori
 
 
 def _scale(name: str, array: np.ndarray, message: str) -> JointVector:
-    """Standard deviations of the columns; a column that does not vary gets the root mean square of the others."""
+    """Returns the standard deviations of the columns; a constant column takes the root mean square of the others."""
     deviation = spread(name, array)
-    # Rounding leaves a constant channel with a deviation of about 1e-17 of the numbers that it was computed from.
+    # Rounding leaves a constant channel with a deviation of about 1e-17 of its inputs.
     varies = deviation > 1e-12 * abs(array).max()
     if not varies.any():
         raise InputError(message)

@@ -3,7 +3,7 @@
     start, replay = model.init(key), empty_replay(2000, 2)
     for outcome, parameters, replay in learn_online(references, drive, refit, start, replay): ...
 
-A replay has a fixed capacity and its empty places have weight zero, so that all refits of a growing data set share one
+A replay buffer has a fixed capacity, and empty places have weight zero, so all refits of a growing data set share one
 compiled program. A refit minimises
 
     sum over samples n and joints j of w_n (tau_hat_nj - tau_nj)² / variance of tau_j,   w_n = 1 for fitted samples
@@ -31,7 +31,7 @@ from dln_jax.solvers import least_squares, levenberg_marquardt
 from dln_jax.types import InputError, require_positive
 
 BLOCKS = 10
-"""Parts of a recording, one of which is held out."""
+"""Parts of a recording; one of them is held out."""
 
 
 class Replay(NamedTuple):
@@ -44,7 +44,7 @@ class Replay(NamedTuple):
     fitted: Float[Any, " N"]
     """1 for samples to fit, otherwise 0."""
     held_out: Float[Any, " N"]
-    """1 for samples that select among the iterates of a refit, otherwise 0."""
+    """1 for samples that select the best iterate of a refit, otherwise 0."""
 
     @property
     def recorded(self) -> int:
@@ -53,16 +53,16 @@ class Replay(NamedTuple):
 
 
 def empty_replay(capacity: int, d: int) -> Replay:
-    """Returns a replay with `capacity` empty places for samples of d joints; `InputError` unless both are positive."""
+    """Returns an empty replay with `capacity` places for samples of d joints; `InputError` unless both are positive."""
     require_positive(capacity=capacity, d=d)
     motion, weight = np.zeros((capacity, d)), np.zeros(capacity)
     return Replay(motion, motion, motion, motion, weight, weight)
 
 
 def append_recording(replay: Replay, q: Any, qd: Any, qdd: Any, tau: Any) -> Replay:
-    """Returns the replay with a further recording in its next empty places.
+    """Adds a recording to the next empty places of a replay.
 
-    Of ten equal parts of the recording the middle one is held out, unless there are fewer samples.
+    The middle one of ten equal parts of the recording is held out, unless there are fewer than ten samples.
 
     Args:
         q, qd, qdd, tau: the recording [n, d], in order of time.
@@ -74,7 +74,7 @@ def append_recording(replay: Replay, q: Any, qd: Any, qdd: Any, tau: Any) -> Rep
     (capacity, d), samples = np.shape(replay.q), len(arrays[0])
     if any(array.shape != (samples, d) for array in arrays):
         shapes = ", ".join(str(array.shape) for array in arrays)
-        raise InputError(f"q, qd, qdd and tau have shapes {shapes}; expected the same [n, {d}] for each")
+        raise InputError(f"q, qd, qdd and tau have shapes {shapes}; expected [n, {d}] for all")
     if not np.isfinite(arrays).all():
         raise InputError("the recording has numbers that are not finite; leave those samples out")
     if used + samples > capacity:
@@ -91,10 +91,10 @@ Refit = Callable[[Parameters, Replay], Parameters]
 
 
 def make_refit(model: Model, *, rounds: int = 6, iterations: int = 5) -> Refit:
-    """Returns a refit by Levenberg-Marquardt in float64: one compiled program for all replays of one capacity.
+    """Returns a refit by Levenberg-Marquardt in float64, one compiled program for all replays of one capacity.
 
-    The refit judges the parameters after every round of iterations. It returns those with the lowest error on the
-    held-out samples, or on the fitted ones if none are held out.
+    The refit evaluates the parameters after every round of iterations. It returns the parameters with the lowest error
+    on held-out samples, or on fitted samples if none are held out.
 
     Args:
         model: model with parameters and energies in float64.
@@ -131,8 +131,8 @@ def make_refit(model: Model, *, rounds: int = 6, iterations: int = 5) -> Refit:
 def make_linear_refit(model: Model) -> Refit:
     """Returns a refit by one least-squares problem on all samples, for a model that is linear in its parameters.
 
-    Initial parameters are ignored. Combinations of parameters that the replay leaves undetermined are zero (the
-    shortest solution, see `solvers.least_squares`).
+    Initial parameters are ignored. Undetermined combinations of parameters are zero (the shortest solution, see
+    `solvers.least_squares`).
 
     Args:
         model: linear in its parameters, such as `make_planar_chain` or `make_rigid_tree`.
@@ -152,7 +152,7 @@ def make_linear_refit(model: Model) -> Refit:
 
 
 def _scale(replay: Replay) -> Float[Array, " d"]:
-    """Standard deviations of the joints' torques in the replay; 1 for a torque that does not vary."""
+    """Returns the standard deviations of the joints' torques in the replay; 1 for a constant torque."""
     weight = replay.fitted + replay.held_out
     mean = jnp.average(replay.tau, axis=0, weights=weight)
     deviation = jnp.sqrt(jnp.average((replay.tau - mean) ** 2, axis=0, weights=weight))
@@ -166,18 +166,19 @@ def learn_online(
     parameters: Parameters,
     replay: Replay,
 ) -> Iterator[tuple[Any, Parameters, Replay]]:
-    """Alternates driving the robot along a reference and refitting the model to all samples recorded so far.
+    """Alternates driving the robot along a reference and refitting the model to all samples so far.
 
-    Yields the outcome of every reference under the model before, and the parameters and replay after its refit.
+    Yields, for each reference, the outcome with the previous model, and the parameters and replay after the refit.
 
     Args:
-        references: in the order of driving; only `drive` reads them.
+        references: references in order, passed to `drive`.
         drive: (parameters, reference) -> outcome, and the recorded q, qd, qdd and tau [n, d]; n may be zero.
         refit: result of `make_refit` or `make_linear_refit`.
-        parameters: parameters that drive the first reference.
+        parameters: parameters for the first reference.
+        replay: samples before the first reference, from `empty_replay`.
 
     Raises:
-        InputError: a recording that `append_recording` refuses.
+        InputError: `append_recording` refuses a recording.
     """
     for reference in references:
         outcome, recording = drive(parameters, reference)

@@ -6,9 +6,9 @@ With J D⁻¹ = U S Vᵀ, torque noise of variance noise_i², and a prior of var
 
     Cov(D theta) = V (S² + ridge)⁻¹ (S Uᵀ Sigma U S + ridge Sigma) (S² + ridge)⁻¹ Vᵀ,   Sigma = diag(noise_i² / unit_i²)
 
-Here torques are in the joints' units `unit_i`, so that J and r need no scale, and noise_i is relative to unit_i.
+This module has torques in the joints' units `unit_i`, so that J and r need no scale, and noise_i is relative to unit_i.
 For ridge = 0 this is the covariance of weighted least squares on the determined directions, for any weights. If all
-joints have the same Sigma it is Laplace's approximation, Sigma (JᵀJ + ridge D²)⁻¹. The degrees of freedom of joint i
+joints have the same Sigma, it is Laplace's approximation, Sigma (JᵀJ + ridge D²)⁻¹. The degrees of freedom of joint i
 are the trace of the hat matrix over its rows:  noise_i² = sum r_i² / (N - dof_i).
 """
 
@@ -21,9 +21,9 @@ from jaxtyping import Float
 from dln_jax.types import JointVector
 
 Rows = Iterator[tuple[np.ndarray, np.ndarray]]
-"""Phi [n, d, P] and tau_hat - tau [n, d] in the joints' units, some samples at a time."""
+"""Phi [n, d, P] and tau_hat - tau [n, d] in the joints' units, in chunks of samples."""
 ALONE = 1e-6
-"""Some samples alone determine a direction if the others hold less than this share of the information on it."""
+"""A group of samples alone determines a direction if the others have less than this fraction of the information."""
 TINY = float(np.finfo(np.float64).tiny)
 
 
@@ -37,14 +37,14 @@ class Spectrum(NamedTuple):
     directions: Float[np.ndarray, "P P"]
     """V, in columns."""
     triangles: Float[np.ndarray, "d r P"]
-    """J_i D⁻¹ V of every joint, up to a rotation of its rows."""
+    """J_i D⁻¹ V of each joint, up to a rotation of its rows."""
     squares: JointVector
     """Sums of squared residuals of the joints, in their units."""
     samples: int
 
 
 class Posterior(NamedTuple):
-    """Covariance of the parameters, noise, and the number of parameters that the data determine."""
+    """Covariance of the parameters, noise, and number of determined parameters."""
 
     along: Float[np.ndarray, "K r"]
     """Factor of the covariance of D theta along the directions of the spectrum."""
@@ -54,7 +54,7 @@ class Posterior(NamedTuple):
 
 
 def spectrum(rows: Rows, *, negligible: float = 0.0) -> Spectrum:
-    """Computes the spectrum of all rows; takes about N d P² operations, and memory for d P² numbers.
+    """Computes the spectrum of all rows in about N d P² operations, with memory for d P² numbers.
 
     Args:
         rows: columns and residuals of the training data.
@@ -85,20 +85,20 @@ def leave_out(
     columns: Float[np.ndarray, "n d P"],
     residual: Float[np.ndarray, "n d"],
 ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
-    """Returns the residuals of training samples as if they had not been fitted, and their variance due to parameters.
+    """Returns leave-out residuals of training samples, and their variance due to the parameters.
 
-    With U their rows of the orthonormal factor of J, r~ = r + U (1 - UᵀU)⁻¹ Uᵀ r: exact for least squares without a
-    ridge (Cook and Weisberg 1982, "Residuals and influence in regression", section 2.2, for groups of samples).
+    With U the samples' rows of the orthonormal factor of J, r~ = r + U (1 - UᵀU)⁻¹ Uᵀ r, which is exact for least
+    squares without a ridge (Cook and Weisberg 1982, "Residuals and influence in regression", section 2.2, for groups).
 
     Args:
         noise: standard deviations from `posterior`.
         columns: Phi D⁻¹ V of the samples.
-        residual: tau_hat - tau of the samples, as all numbers here in the joints' units.
+        residual: tau_hat - tau of the samples, in the joints' units.
     """
     counts = spectrum.sizes > 0
     U, every = (part[..., counts] / spectrum.sizes[counts] for part in (columns.swapaxes(0, 1), spectrum.triangles))
     values, vectors = np.linalg.eigh(np.eye(U.shape[2]) - gram(U, np.ones_like(noise)))
-    # A direction that only these samples determine is fitted exactly: its residual is zero and carries no information.
+    # If only these samples determine a direction, its fit is exact and its zero residual carries no information.
     inverse = (vectors * np.divide(1, values, out=np.zeros_like(values), where=values > ALONE)) @ vectors.T
     covariance = inverse @ (gram(every, noise) - gram(U, noise)) @ inverse
     predicted = U @ (inverse @ np.einsum("inp,ni->p", U, residual))
@@ -112,13 +112,13 @@ def gram(rows: Float[np.ndarray, "d n P"], noise: JointVector) -> Float[np.ndarr
 
 
 def leading_directions(rows: Callable[[], Rows], count: int) -> Float[np.ndarray, "P K"]:
-    """Returns the combinations of parameters that the data determine best, for models too large for a full spectrum.
+    """Returns the best-determined combinations of parameters, for models too large for a full spectrum.
 
     Subspace iteration on D⁻¹JᵀJ D⁻¹ (Halko, Martinsson and Tropp 2011, algorithm 4.4). Phi times the result is the
-    Jacobian of a model whose parameters vary only in that subspace (Izmailov et al. 2020, "Subspace inference").
+    Jacobian of a model with parameters in that subspace only (Izmailov et al. 2020, "Subspace inference").
 
     Args:
-        rows: iterates over the training data anew at every call.
+        rows: starts a new pass over the training data at each call.
         count: K.
     """
     squares = sum(np.sum(columns**2, axis=(0, 1)) for columns, _ in rows())
@@ -137,7 +137,7 @@ def posterior(spectrum: Spectrum, ridge: float) -> Posterior:
     shares = spectrum.triangles[..., counts] / damped
     dof = np.sum(shares**2, axis=(1, 2))
     noise = np.sqrt(spectrum.squares / np.maximum(spectrum.samples - dof, 1.0))
-    # Relative to the largest, because the variances of an exact fit are squares of rounding errors.
+    # Relative to the largest, because an exact fit has variances of squared rounding errors.
     largest = max(float(noise.max(initial=0.0)), TINY)
     relative = noise / largest
     inner = gram(shares, relative) + np.diag(np.mean(relative**2) * ridge / damped**2)

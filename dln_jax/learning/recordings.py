@@ -1,10 +1,9 @@
 """Fits models to recordings of q and commanded torques, in four steps.
 
-1. The delay of the torques, unless known, is the one that gives an identified model the smallest residual.
-2. q is smoothed (`data.encoders`), which also gives qd; torques are not filtered, and held between samples.
-3. The identified model is the trigonometric one, fitted by the weak form of its equations (`learning.momentum`). Its
-   residuals in the joints' equations are the scales of a network's errors, so that joints with and without a motor
-   both count.
+1. An unknown delay of the torques is chosen by the smallest residual of an identified model.
+2. q is smoothed (`data.encoders`), which also gives qd. Torques are not filtered, and are held between samples.
+3. A trigonometric model is fitted by the weak form of its equations (`learning.momentum`). Its residuals set the scale
+   of a network's errors in each joint, so that joints with and without a motor have similar weight.
 4. The network is a structured DeLaN with the same friction laws, fitted to the same windows by Gauss-Newton.
 """
 
@@ -39,15 +38,15 @@ from dln_jax.types import FrictionLaw, InputError, Needs
 from dln_jax.zoo.descriptions import Description, build, describe
 
 SURE = 4.0
-"""An estimated delay is rounded if it is within this number of standard errors of a whole number."""
+"""A delay within this number of standard errors of a whole number is rounded."""
 LAWS: tuple[FrictionLaw, ...] = ("viscous", "coulomb")
-"""Friction laws of the models; other friction of the plant, near rest, is not modelled."""
+"""Friction laws of the models; other friction near rest is not modelled."""
 MOST_DELAY = 4
 DEGREE = 2
-"""Degree of the identified mass matrix in every angle: enough for rigid bodies. Displacements along a level rail have
-no effect."""
+"""Degree of the identified mass matrix in each angle, which is enough for rigid bodies. Displacements along a level
+rail have no effect."""
 CHECKED = 500
-"""Number of the recording's positions for checking the mass matrix."""
+"""Number of recorded positions for checking the mass matrix."""
 WIDTH, DEPTH = 8, 2
 """Size of the network."""
 STEPS = 40
@@ -70,7 +69,7 @@ class FittedPlant(NamedTuple):
 
 
 class PreparedRecording(NamedTuple):
-    """A recording that is ready for fits."""
+    """A recording with rates and acting torques, ready for fits."""
 
     train: Trajectories
     """Episodes to fit, with rates and acting torques."""
@@ -82,10 +81,10 @@ class PreparedRecording(NamedTuple):
 
 
 def driven_torques(data: Trajectories, *, delay: float) -> Trajectories:
-    """Returns the torques that act at the samples, from commanded torques that are delayed and held between samples.
+    """Converts commanded torques, which are delayed and held between samples, to torques that act at the samples.
 
-    A torque held over a step contributes to both its ends: the torque at a sample is the mean of those held before and
-    after it. The first torques of a trajectory, before the first command, are zero.
+    The torque at a sample is the mean of the torques held before and after it. The first torques of a trajectory,
+    before the first command, are zero.
 
     Args:
         delay: delay of the commands in samples.
@@ -102,15 +101,15 @@ def driven_torques(data: Trajectories, *, delay: float) -> Trajectories:
 
 
 def delay_of_torques(model: Model, recording: Trajectories) -> float:
-    """Estimates the delay of torques in samples: that with the smallest residuals of a model linear in its parameters.
+    """Estimates the delay of torques in samples by the smallest residuals of a model linear in its parameters.
 
-    Commands of hardware may take effect between samples. The fitted equations' residuals r are linear in the torques:
-    between the whole delays k and k + 1, up to `MOST_DELAY`,
+    Commands of hardware may take effect between samples. The residuals r of the fit are linear in the torques, so
+    between whole delays k and k + 1, up to `MOST_DELAY`,
 
         r = r_k - s D,    D = r_k - r_{k+1},    s = r_k . D / D . D
 
-    The episodes' parts of r . D give the standard error of s. A delay within `SURE` standard errors of a whole number
-    is rounded to it.
+    The contributions of the episodes to r . D give the standard error of s. A delay within `SURE` standard errors of a
+    whole number is rounded.
 
     Args:
         model: model that is linear in its parameters, such as `make_trigonometric`.
@@ -134,7 +133,7 @@ def delay_of_torques(model: Model, recording: Trajectories) -> float:
         total = float(np.sum(change**2)) or np.inf
         share = float(np.clip(np.sum(earlier * change) / total, 0.0, 1.0))
         left = earlier - share * change
-        # Windows of one episode share their errors, so that each episode counts once.
+        # Errors of windows in one episode are correlated, so each episode counts once.
         parts = [np.sum((left * change)[episode == one]) for one in np.unique(episode)]
         count = len(parts)
         error = np.sqrt(np.sum(np.square(parts)) * count / (count - 1)) / total if count > 1 else np.inf
@@ -146,14 +145,14 @@ def delay_of_torques(model: Model, recording: Trajectories) -> float:
 def prepare(
     recording: Trajectories, *, delay: float | None = None, chain: bool = False, cutoffs: Sequence[float] = (1.0,)
 ) -> PreparedRecording:
-    """Computes rates and acting torques, and splits off the middle episode for validation.
+    """Computes rates and acting torques, and holds out the middle episode for validation.
 
     Args:
         recording: several episodes, with the needs of the plant.
         delay: delay of the torques in samples (default: estimated).
-        chain: whether the plant is one for `identified_chain`.
-        cutoffs: multiples of the cut-off that `smooth` chooses; of several, the one whose identified model predicts
-            validation best (`acceleration_misfit`) is taken.
+        chain: whether the plant is for `identified_chain`.
+        cutoffs: multiples of the cut-off that `smooth` chooses; the validation error of the identified model
+            (`acceleration_misfit`) chooses between several.
 
     Raises:
         InputError: a recording without needs or with only one episode.
@@ -161,8 +160,8 @@ def prepare(
     present = np.unique(recording.trajectory)
     if recording.needs is None or len(present) < 2:
         raise InputError(
-            f"the recording has {len(present)} episode(s){'' if recording.needs else ', and states no needs'}; "
-            "expected at least 2, one of them to select by, and needs: record more, or cut it"
+            f"the recording has {len(present)} episode(s){'' if recording.needs else ' and no needs'}; "
+            "expected at least 2, one of them for validation, and needs: record more, or cut it"
         )
     held_out = int(present[len(present) // 2])
     model, recording = build(_trigonometric(recording.needs, chain=chain)), held_at_equal_steps(recording)
@@ -190,7 +189,7 @@ def _described(name: str, needs: Needs, **keywords: Any) -> Description:
 
 
 def _trigonometric(needs: Needs, *, chain: bool) -> Description:
-    """The mass matrix of a chain on a fixed base does not depend on the first coordinate."""
+    """Describes the trigonometric model; a chain's mass matrix does not depend on the first coordinate."""
     turns = [int(joint == "revolute") for joint in needs.joints]
     degree = [DEGREE * turn for turn in turns]
     if chain:
@@ -199,9 +198,9 @@ def _trigonometric(needs: Needs, *, chain: bool) -> Description:
 
 
 def _chains(needs: Needs) -> list[Description]:
-    """Chains of rigid bodies: those whose links move in one plane, with all directions of the later axes, and any.
+    """Describes planar chains of rigid bodies, with both directions of each later axis, and a general chain.
 
-    Planar chains have far fewer coefficients. Slides that come first may point anywhere.
+    Planar chains have far fewer coefficients. Slides at the base may point anywhere.
     """
     slides, hinges = (needs.joints.count(joint) for joint in ("prismatic", "revolute"))
     planar = []
@@ -226,11 +225,11 @@ def identified(data: Trajectories, needs: Needs) -> FittedPlant:
 
 
 def identified_chain(prepared: PreparedRecording, needs: Needs) -> FittedPlant:
-    """Fits a chain of rigid bodies on a fixed base, in relative coordinates, for which fewer motions suffice.
+    """Fits a chain of rigid bodies on a fixed base, in relative coordinates, which needs fewer motions.
 
-    Whether all links move in one plane, which axes point the other way, and how the equations are weighted is decided
-    by the smallest `acceleration_misfit` in the validation episode. Models whose mass matrix is not positive definite
-    at the recording's positions are left out.
+    The smallest `acceleration_misfit` in the validation episode decides whether all links move in one plane, which axes
+    have the opposite direction, and how the equations are weighted. Models with an indefinite mass matrix at the
+    recorded positions are left out.
 
     Raises:
         InputError: as for `fit_momentum`, or all models are left out.
@@ -256,8 +255,8 @@ def identified_chain(prepared: PreparedRecording, needs: Needs) -> FittedPlant:
                 best, least = FittedPlant(description, parameters), float(misfit)
     if best is None:
         raise InputError(
-            f"the identified mass matrix is positive definite at {share:.1%} of the recording's positions; expected "
-            "all: record more or livelier motions of every joint"
+            f"the identified mass matrix is positive definite at only {share:.1%} of the recorded positions; record "
+            "more or faster motions of every joint"
         )
     return best
 
@@ -265,7 +264,7 @@ def identified_chain(prepared: PreparedRecording, needs: Needs) -> FittedPlant:
 def learned(
     prepared: PreparedRecording, needs: Needs, *, seed: int = 0, report: ProgressReport = silent
 ) -> FittedPlant:
-    """Trains a structured DeLaN with viscous and dry friction and keeps the parameters that are best in validation.
+    """Trains a structured DeLaN with viscous and dry friction, and keeps the best parameters by validation.
 
         r_w = [integral w (s - tau) dt - integral w' p dt] / unit_w
 

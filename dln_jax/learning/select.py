@@ -1,9 +1,9 @@
 """Model selection by validation: fits candidates in turn, and keeps one by a rule.
 
-A larger network always fits its training samples better, and soon fits their noise. One candidate is better than
-another if its validation error is lower by more than the standard error of their paired difference over the validation
-samples (the one-standard-error rule of Breiman et al. 1984, paired). The rule `simplest` keeps the first candidate that
-no other betters significantly.
+A larger network always fits its training samples better, and soon fits their noise. A candidate is significantly better
+than another if its validation error is lower by more than the standard error of their paired difference over the
+validation samples (the one-standard-error rule of Breiman et al. 1984, paired). The rule `simplest` keeps the first
+candidate that no other one significantly improves.
 """
 
 import io
@@ -24,7 +24,7 @@ from dln_jax.learning.engine.checkpoint import Context
 from dln_jax.types import InputError, SampleIndex, SampleVector
 
 SEGMENT = 0.5
-"""Length in s of a segment whose mean error counts as one measurement: neighbouring samples are not independent."""
+"""Length of a segment in s. Its mean error counts as one measurement, since neighbouring samples are correlated."""
 
 
 class Trial(NamedTuple):
@@ -32,13 +32,13 @@ class Trial(NamedTuple):
 
     candidate: Any
     outcome: Any
-    """The fit, or the reason why there is none."""
+    """The fit, or the reason for failure."""
     errors: Any
-    """[N] squared error of every validation sample; `None` without a fit."""
+    """[N] squared error of each validation sample; `None` without a fit."""
 
     @property
     def validation(self) -> float:
-        """Mean squared error; inf if there is none or it is not finite."""
+        """Mean squared error; inf if it is missing or not finite."""
         mean = math.inf if self.errors is None else float(np.mean(self.errors))
         return mean if np.isfinite(mean) else math.inf
 
@@ -48,7 +48,7 @@ Selection = tuple[Trial, list[Trial]]
 
 
 def significantly_better(errors: SampleVector, others: SampleVector, *, margin: float = 1.0) -> bool:
-    """Whether `errors` are lower than `others` on average, by more than `margin` standard errors of the difference."""
+    """Whether `errors` are lower than `others` on average by more than `margin` standard errors of the difference."""
     gain = others - errors
     if not np.isfinite(gain.mean()):
         return bool(np.isfinite(np.mean(errors)))
@@ -62,7 +62,7 @@ def lowest(trials: Sequence[Trial]) -> Trial:
 
 
 def simplest(trials: Sequence[Trial]) -> Trial:
-    """Returns the first trial whose error no other betters significantly."""
+    """Returns the first trial that no other one significantly improves."""
     best = lowest(trials)
     return next(trial for trial in trials if not significantly_better(best.errors, trial.errors))
 
@@ -79,11 +79,11 @@ def select(
     """Fits candidates in order; returns the chosen trial and all trials.
 
     Args:
-        candidates: in order of size; they may depend on the trials so far.
-        fit: candidate -> outcome, and the squared error of every validation sample; or why there is no fit, and `None`.
+        candidates: candidates in order of size; an iterator may depend on earlier trials.
+        fit: candidate -> outcome and squared error of each validation sample; or reason for failure, and `None`.
         rule: chooses among the trials with a fit.
         patience: stop after this many candidates in a row without significant improvement.
-        until: reading of `time.perf_counter` after which no further candidate is tried, once one is fitted.
+        until: reading of `time.perf_counter` at which the selection ends, after the first successful fit.
         stop: whether a trial is good enough to stop at once.
 
     Raises:
@@ -110,7 +110,7 @@ def select(
 
 
 def segments(data: Trajectories, seconds: float = SEGMENT) -> SampleIndex:
-    """Returns the index of every sample's time segment; segments end at the ends of trajectories."""
+    """Returns the index of each sample's time segment; segments do not cross trajectories."""
     within = np.floor(data.t / seconds).astype(int)
     within -= within.min()
     _, numbers = np.unique(data.trajectory * (within.max() + 1) + within, return_inverse=True)
@@ -118,7 +118,7 @@ def segments(data: Trajectories, seconds: float = SEGMENT) -> SampleIndex:
 
 
 def mean_of_segments(data: Trajectories, errors: Float[np.ndarray, "N ..."]) -> Float[np.ndarray, "S ..."]:
-    """Means of samples' errors over their time segments."""
+    """Averages the errors of samples over their time segments."""
     numbers = segments(data)
     sums = np.zeros((numbers.max() + 1, *errors.shape[1:]))
     np.add.at(sums, numbers, errors)
@@ -126,12 +126,12 @@ def mean_of_segments(data: Trajectories, errors: Float[np.ndarray, "N ..."]) -> 
 
 
 def say_selection(context: Context, title: str, kept: str, ended: str, rows: Sequence[dict[str, Any]]) -> None:
-    """Says a table of the candidates, and why the selection ended; writes both into the run's folder.
+    """Prints a table of the candidates and the reason for an early end; writes both into the run folder.
 
     Args:
-        kept: name of the kept candidate.
-        ended: why no further candidate was tried; empty if all were.
-        rows: a dictionary for each candidate, with its `name`; lists and texts are not shown.
+        kept: name of the selected candidate.
+        ended: reason for an early end; empty if all candidates were tried.
+        rows: one dictionary per candidate, with its `name`; lists and texts are not shown.
     """
     shown = [key for key in dict.fromkeys(itertools.chain(*rows)) if key not in ("name", "joints", "reason")]
     table = Table("model", *(key.replace("_", " ") for key in shown), "", title=title)

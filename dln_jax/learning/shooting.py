@@ -1,32 +1,32 @@
-"""Trajectory matching: fits a model so that its motions pass through the measurements (multiple shooting).
+"""Trajectory matching (multiple shooting): fits a model so that its motions pass through the measurements.
 
-Trajectories are cut into short windows. A window's motion starts at a state z_w that is itself unknown:
+Trajectories are cut into short windows. The motion of each window starts at an unknown state z_w:
 
     minimise over theta and all z_w:   sum over windows and samples of |(x(t; z_w, theta) - x_measured) / noise|²
 
-(Bock 1981; Hairer, Norsett and Wanner 1993, section II.6.) No derivative is estimated and no noise is differentiated.
-Free starts average out noise, whereas derivative matching evaluates the field at noisy states and is biased. Windows
-never reach across a gap, that is, a time step of more than 1.5 times the median.
+(Bock 1981; Hairer, Norsett and Wanner 1993, section II.6.) This needs no derivatives of noisy data. Free starts average
+out noise, whereas derivative matching evaluates the field at noisy states and is biased. Windows do not cross gaps
+(time steps of more than 1.5 times the median).
 
-**Phase fields** have the state x = (q, p), and their loss may add |(rates(x) - rates_measured) / rate_noise|². Their
-problem has theta and all starts as parameters. Gauss-Newton solves for all at once; its matrix has a row for every
-unknown. Adam, for networks that are too large for that, takes batches of windows, and the cost of its steps does not
-depend on the number of windows.
+**Phase fields** have the state x = (q, p), and their loss may add |(rates(x) - rates_measured) / rate_noise|². The
+parameters of the problem are theta and all starts. Gauss-Newton solves for all of them together, with one matrix row
+per unknown. Adam, for larger networks, takes batches of windows, and the cost of a step does not depend on the number
+of windows.
 
-**Measured coordinates** have the state (q, qd), with or without torques. Momenta p = dL/dqd are the model's own, so
-coupled joints are no harder than a single one, and any energies of `mechanics.equations.dynamics` work. qd counts only
-if it was measured. The problem's parameters are the model's alone, for any number of windows: starts are eliminated
-window by window (`without_start`), by
+**Measured coordinates** have the state (q, qd), with or without torques. The model defines the momenta p = dL/dqd, so
+coupled joints are as easy as a single one, and any energies of `mechanics.equations.dynamics` work. qd counts only if
+it was measured. The parameters of the problem are the model's parameters for any number of windows, because the starts
+are eliminated window by window (`without_start`), by
 
     z(theta) = argmin over z of |r(theta, z)|²,   dr/dtheta = (1 - U Uᵀ) dr/dtheta at fixed z,   U a basis of dr/dz
 
 This is the derivative of Kaufman (1975, "A variable projection method for solving separable nonlinear least squares
-problems"), which omits a term that is small if the residual is.
+problems"), which omits a term that is small for small residuals.
 
-Torque errors drive simulated motions off course. With `Noise.tau` every window has an unknown constant torque e_w and a
-residual e_w / noise_tau: a compromise between matching motions under exact torques and torques of exact motions.
+Torque errors drive simulated motions off course. With `Noise.tau` each window has an unknown constant torque e_w and a
+residual e_w / noise_tau, a compromise between matching motions for exact torques and torques for exact motions.
 
-Motion without torques fits any multiple of an energy: a `Gauge` fixes the multiple.
+Motion without torques fits any multiple of an energy. A `Gauge` fixes the multiple.
 """
 
 import functools
@@ -51,9 +51,9 @@ from dln_jax.solvers.elimination import solve
 from dln_jax.types import InputError, require_positive
 
 START_STEPS = 3
-"""Gauss-Newton steps from the measured start of a window to the nearest one."""
+"""Gauss-Newton steps from the measured start of a window to the best one."""
 GAUGE_TOLERANCE = 0.01
-"""Relative distance from a gauge that counts as one standard deviation; the fit meets the gauge exactly."""
+"""Standard deviation of the mass relative to a gauge; the fit meets the gauge exactly."""
 
 
 class MeasuredWindows(NamedTuple):
@@ -64,7 +64,7 @@ class MeasuredWindows(NamedTuple):
     q: np.ndarray
     """[W, T, d]."""
     qd: np.ndarray
-    """[W, T, d], measured, or an estimate that only provides the initial start."""
+    """[W, T, d], measured, or estimated as an initial start only."""
     tau: np.ndarray
     """[W, T, d]."""
     weight: np.ndarray
@@ -76,12 +76,12 @@ class MeasuredWindows(NamedTuple):
 
 
 def cut_measured_windows(data: Trajectories, length: int) -> MeasuredWindows:
-    """Cuts consecutive windows of `length` samples; a window begins with the last sample of the one before.
+    """Cuts consecutive windows of `length` samples; a window begins with the last sample of the previous one.
 
-    Windows lie within segments without a gap. The remainder of a segment is a shorter window.
+    Windows do not cross gaps. The remainder of a segment is a shorter window.
 
     Raises:
-        InputError: a length below 2, or no two samples without a gap between them.
+        InputError: a length below 2, or gaps between all samples.
     """
     rows, weight = window_indices(data, length)
     p, pd = (None if values is None else values[rows] for values in (data.p, data.pd))
@@ -90,11 +90,11 @@ def cut_measured_windows(data: Trajectories, length: int) -> MeasuredWindows:
 
 
 Deviations = tuple[float, ...] | float
-"""Standard deviations of quantities, or one of all of them."""
+"""Standard deviations of several quantities, or one for all."""
 
 
 class Weights(NamedTuple):
-    """Standard deviations that divide the residuals; a larger one gives less weight."""
+    """Standard deviations that divide the residuals; larger ones reduce the weight."""
 
     state: Deviations
     """Standard deviations of q and p, one number or 2 d; infinite for quantities that were not measured."""
@@ -105,13 +105,13 @@ class Weights(NamedTuple):
 def phase_motion(
     field: Flow | PhaseRates, start: Array, t: Float[Array, " T"], *, substeps: int
 ) -> Float[Array, "T two_d"]:
-    """States (q, p) at the times t from `start` [2 d], by RK4."""
+    """Integrates the states (q, p) from `start` [2 d] to the times t by RK4."""
     first = tuple(jnp.split(start, 2))
     return jnp.concatenate(rollout(rk4(lambda t, state: field.rates(*state)), first, t, substeps=substeps), axis=1)
 
 
 def weigh(weight: Array, *errors: Array) -> Array:
-    """Concatenates errors [T, n] of a window, weighted so that their squares sum to a mean over its samples."""
+    """Concatenates and weights errors [T, n] of a window; the sum of their squares is a mean over its samples."""
     size = jnp.sqrt(weight / jnp.sum(weight))[:, None]
     return jnp.concatenate([jnp.ravel(size * error) for error in errors])
 
@@ -128,7 +128,7 @@ def phase_problem(
 ) -> Problem:
     """Builds the problem of fitting a model to windows, in float64, with parameters {"model": ..., "starts": ...}.
 
-    The validation windows select the parameters, by the distance of simulated motions after fitting their starts too.
+    The validation windows select the parameters by the distance of simulated motions, with fitted starts.
 
     Args:
         model: a phase model with float64 parameters.
@@ -138,7 +138,7 @@ def phase_problem(
         substeps: RK4 steps between two samples.
 
     Raises:
-        InputError: no windows, weights that are not positive, or momenta or rates that the windows lack.
+        InputError: windows, momenta or rates are missing, or weights are not positive.
     """
     require_positive(substeps=substeps)
     require_windows(windows, validation, state_weight=weights.state, rate_weight=weights.rate)
@@ -175,11 +175,13 @@ def require_windows(windows: MeasuredWindows, validation: MeasuredWindows, **dev
         for deviation in np.ravel(values) if values is not None else ():
             require_positive(**{name: float(deviation)})
     if not len(windows.t) or not len(validation.t):
-        raise InputError(f"{len(windows.t)} windows to fit, {len(validation.t)} to validate; expected some of each")
+        raise InputError(
+            f"there are {len(windows.t)} windows to fit, {len(validation.t)} to validate; expected at least 1 of each"
+        )
 
 
 def without_start(frozen: Callable[[Array], Array], residual: Callable[[Array], Array], start: Array) -> Array:
-    """Returns the residual at its nearest start; its derivative in the parameters that `frozen` fixes is Kaufman's.
+    """Returns the residual at its best start, with Kaufman's derivative in the parameters that `frozen` fixes.
 
     Args:
         frozen: start -> residual, with constant parameters.
@@ -193,12 +195,12 @@ def without_start(frozen: Callable[[Array], Array], residual: Callable[[Array], 
 
 
 def nearest(residual: Callable[[Array], Array], start: Array, *, steps: int = START_STEPS) -> Array:
-    """Returns a start of lower residual, by steps of Gauss-Newton."""
+    """Lowers the residual by Gauss-Newton steps of the start."""
     return _descend(residual, start, steps)[0]
 
 
 def _descend(residual: Callable[[Array], Array], start: Array, steps: int) -> tuple[Array, Array]:
-    """Returns the start after some steps, and dr/dz at the beginning of the last one."""
+    """Returns the start after some steps, and dr/dz before the last step."""
     linearised = jax.jacfwd(lambda start: (residual(start),) * 2, has_aux=True)
 
     def step(at: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
@@ -216,17 +218,17 @@ class Noise(NamedTuple):
     qd: Deviations | None = None
     """`None` if velocities were not measured."""
     tau: Deviations | None = None
-    """Standard deviation of the mean torque over a window; `None` if torques are exact. The torque error is then
-    an unknown of every window, like its start."""
+    """Standard deviation of the mean torque over a window; each window then has an unknown torque error besides its
+    start. `None` if torques are exact."""
 
 
 class Gauge(NamedTuple):
-    """Fixes the multiple of an energy, which motions without torques leave free."""
+    """Fixes the scale of an energy, which motions without torques do not determine."""
 
     q: tuple[float, ...]
-    """Position where the mass matrix is evaluated."""
+    """Position of the evaluated mass matrix."""
     mass: float = 1.0
-    """Mean of its diagonal there, kg m² or kg."""
+    """Mean of its diagonal, kg m² or kg."""
 
 
 def motion(
@@ -238,7 +240,7 @@ def motion(
     torque: Torque = "interpolated",
     substeps: int = 1,
 ) -> Float[Array, "T two_d"]:
-    """States (q, qd) at the times t from `start`, by RK4, with or without torques."""
+    """Integrates the states (q, qd) from `start` to the times t by RK4, with or without torques."""
     first = tuple(jnp.split(start, 2))
     driving = jnp.zeros((len(t), len(first[0])), start.dtype) if tau is None else tau
 
@@ -264,20 +266,20 @@ def measured_problem(
 ) -> Problem:
     """Builds the problem of fitting a model's parameters to windows, in float64, with the starts eliminated.
 
-    The validation windows select the parameters, by the distance of simulated motions after fitting their starts too.
+    The validation windows select the parameters by the distance of simulated motions, with fitted starts.
 
     Args:
-        model: built from any energies, or from accelerations, with float64 parameters.
+        model: any model of energies or accelerations, with float64 parameters.
         parameters: initial parameters, for example from `learning.matching.accelerations_problem`.
         validation: windows that select the parameters.
-        noise: standard deviations of the measurements; noise alone then gives a loss of d (2 d if velocities were
-            measured), less what the starts absorb.
+        noise: standard deviations of the measurements. Noise alone gives a loss of d (2 d with measured velocities)
+            minus the part that the starts absorb.
         gauge: fixes the scale of the energies; needed only for motions without torques.
         torque: torque between samples.
         substeps: RK4 steps between two samples.
 
     Raises:
-        InputError: no windows, noise that is not positive, neither torques nor a gauge, or a gauge of the wrong size.
+        InputError: no windows, noise that is not positive, no torques and no gauge, or a gauge of the wrong size.
     """
     require_positive(substeps=substeps)
     d = windows.q.shape[2]
@@ -316,7 +318,7 @@ def measured_problem(
 
 
 def check_gauge(gauge: Gauge | None, tau: np.ndarray, d: int) -> None:
-    """Raises `InputError` if there are neither torques nor a gauge, or the gauge has a wrong size or a mass <= 0."""
+    """Raises `InputError` if torques and gauge are both missing, or the gauge has a wrong size or a mass <= 0."""
     if gauge is None:
         if not np.any(tau):
             raise InputError("motions without torques fit any multiple of an energy; give a gauge")
@@ -327,7 +329,8 @@ def check_gauge(gauge: Gauge | None, tau: np.ndarray, d: int) -> None:
 
 
 def gauge_error(system: Dynamics | InverseForward, gauge: Gauge | None) -> Float[Array, " n"]:
-    """Distance of the mass matrix from the gauge, in units of `GAUGE_TOLERANCE` [1]; empty without either."""
+    """Returns the distance [1] of the mass matrix from the gauge in units of `GAUGE_TOLERANCE`; empty without a
+    gauge."""
     if gauge is None or not isinstance(system, Dynamics):
         return jnp.zeros(0)
     masses = jnp.diagonal(system.mass_matrix(jnp.asarray(gauge.q)))

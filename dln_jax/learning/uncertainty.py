@@ -3,25 +3,24 @@
     uncertainty = estimate(model, parameters, train, validation, ridge=0.0).uncertainty
     torque_std = predictive(model, parameters, uncertainty.factor, uncertainty.noise)
 
-The covariance of the parameters is that of the least-squares fit (`learning.posterior`). For models that are linear in
-them, as `fit_linear` fits them, `ridge=0.0` is exact. A network trained on torques is linearised about its parameters
-(Laplace's approximation) with the ridge of `RIDGES` that makes the validation torques most likely. For networks with
-more than `MOST_PARAMETERS` only the `DIRECTIONS` leading combinations are uncertain; the rest counts as known.
+The least-squares fit gives the covariance of the parameters (`learning.posterior`). For linear models, as fitted by
+`fit_linear`, `ridge=0.0` is exact. A network trained on torques is linearised about its parameters (Laplace's
+approximation), with the ridge of `RIDGES` that maximises the likelihood of the validation torques. In networks with
+more than `MOST_PARAMETERS`, only the `DIRECTIONS` leading combinations are uncertain; the rest counts as known.
 
-Residuals are not only white noise: they include model errors, and those of neighbouring samples are correlated.
-Held-out motions therefore scale both parts of the variance of every joint,
+Residuals are not only white noise: they include model errors, and neighbouring residuals are correlated. Held-out
+motions therefore scale both parts of the variance of each joint,
 
     a noise² + b |phi F|²,   (a, b) = (1, 1), (a, a) or (a, b), of the greatest likelihood.
 
 The simplest form is kept unless another is better by more than half the logarithm of the effective samples per extra
-factor (Schwarz 1978): a few seconds that agree with the training change nothing. The held-out motions are those of the
-validation and, for least squares, also those of the training, each as if it had been left out (`posterior.leave_out`).
-Both parts are then multiplied by the `scatter` of the motions, because model errors differ between motions.
+factor (Schwarz 1978). Validation motions are held out and, for least squares, also each training motion in turn
+(`posterior.leave_out`). Both factors are then scaled by how much the errors differ between motions (`scatter`).
 
-A model that is linear in its parameters is right wherever the data determine its torque, even far from the data. No
-state is therefore out of distribution while its deviation due to parameters is below `HARMLESS` of the torque. Above
-that, a state is out of distribution if its deviation exceeds those on the data, or if it leaves the range of the data.
-For a network, every state outside that range is out of distribution.
+A linear model is right wherever the data determine its torque, even far from the data. A state is therefore in
+distribution while its deviation due to parameters is below `HARMLESS` of the torque. Above that, a state is out of
+distribution if its deviation exceeds the deviations on the data, or if it leaves the range of the data. For a network,
+every state outside that range is out of distribution.
 """
 
 import math
@@ -42,18 +41,18 @@ from dln_jax.types import InputError, JointVector, SampleVector, require_positiv
 
 RIDGES = (1e-18, 1e-16, 1e-14, 1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2)
 RATIOS = (0.0, *map(math.pow, [10.0] * 33, np.arange(-8, 25) / 4))
-"""Ratios b / a that are tried."""
+"""Trial ratios b / a."""
 MOST_PARAMETERS, DIRECTIONS = 1_500, 400
 FOLDS = 10
-"""Number of groups of training trajectories that are left out in turn."""
+"""Number of groups of training trajectories to leave out in turn."""
 MOST_SAMPLES = 2_000
 """Largest number of validation samples, evenly spaced."""
 HARMLESS = 0.01
-"""States of linear models whose deviation due to parameters is below this share of the torque's are never flagged."""
+"""Linear models never flag states with a deviation due to parameters below this fraction of the torque's."""
 STILL = 1e-3
-"""Lower bound on the range of a coordinate, in rad, m, 1/s or 1/s², for coordinates that rest in all data."""
+"""Lower bound on the range of a coordinate that rests in all data, in rad, m, 1/s or 1/s²."""
 CHUNK = 256
-"""Samples per call of the program that linearises the model."""
+"""Samples per call of the linearised model."""
 UPPER = 0.975
 """Quantile of a two-sided 95 % band; `scatter` uses it to widen bands from few motions."""
 
@@ -64,7 +63,7 @@ class Estimate(NamedTuple):
     uncertainty: Uncertainty
     ridge: float
     degrees_of_freedom: JointVector
-    """Number of parameters that the joints' data determine."""
+    """Number of parameters that each joint's data determine."""
     training_noise: JointVector
     """Standard deviation of the training residuals, N m or N, before calibration."""
 
@@ -81,20 +80,21 @@ def estimate(
     quantile: float = 0.999,
     margin: float = 1.25,
 ) -> Estimate:
-    """Estimates the uncertainty of a model of torques, in float64 whatever the model's dtype.
+    """Estimates the uncertainty of a torque model; computes in float64 for any dtype of the model.
 
     Args:
-        model: fitted to torques.
-        train: data of the fit.
-        validation: other trajectories, used for model selection at most.
-        ridge: dimensionless, as in `learning.posterior`; 0 for least squares; by default chosen by validation.
-        unit: scales of the joints' residuals in the fit, N m or N; by default `torque_scale`.
-        negligible: the value that `fit_linear` used.
+        model: model fitted to torques.
+        parameters: its parameters.
+        train: training data.
+        validation: other trajectories, which may have served for model selection.
+        ridge: dimensionless, as in `learning.posterior`; 0 for least squares (default: chosen by validation).
+        unit: scales of the joints' residuals in the fit, N m or N (default: `torque_scale`).
+        negligible: as for `fit_linear`.
         quantile: quantile of the data that sets the thresholds of `out_of_distribution`.
-        margin: factor on the thresholds: held-out motions of the same kind go a little further.
+        margin: factor on the thresholds, since new motions of the same kind go a little further.
 
     Raises:
-        InputError: a setting out of range, parameters that are not finite, or torques that do not vary.
+        InputError: a setting out of range, parameters that are not finite, or constant torques.
     """
     require_positive(margin=margin)
     if not 0 < quantile <= 1:
@@ -121,13 +121,13 @@ def estimate(
         known = spectrum(rows(train), negligible=negligible)
 
         def along(data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
-            """Phi D⁻¹ V [N, d, P] and the residuals [N, d] of some data."""
+            """Returns Phi D⁻¹ V [N, d, P] and the residuals [N, d] of some data."""
             columns, residuals = map(np.concatenate, zip(*rows(data), strict=True))
             return columns / known.scale @ known.directions, residuals
 
         (fitted, _), (judged, residual) = along(some), along(held_out)
         folds, present = [], np.unique(train.trajectory)
-        if ridge == 0 and len(present) > 1:  # training data as if held out, a fold of trajectories at a time
+        if ridge == 0 and len(present) > 1:  # leave out one fold of training trajectories at a time
             sd = posterior(known, 0.0).noise
             parts = (select(train, indices) for indices in np.array_split(present, min(FOLDS, len(present))))
             folds = [(*leave_out(known, sd, *along(part)), part.trajectory) for part in parts]
@@ -163,9 +163,9 @@ def calibration(
     """Returns (a, b) of a noise² + b variance for the residuals of one joint, and their mean negative log-likelihood.
 
     Args:
-        residual: residuals of the validation, N m or N.
-        noise: standard deviation of the torque noise, from the training.
-        variance: variances due to parameters.
+        residual: validation residuals, N m or N.
+        noise: standard deviation of the torque noise, from training.
+        variance: variances due to the parameters.
         samples: number of independent residuals.
     """
     ratios = np.asarray(RATIOS)[:, None]
@@ -185,22 +185,22 @@ def calibration(
 
 
 def scatter(relative: SampleVector, trajectory: np.ndarray) -> float:
-    """Returns the factor, at least 1, that raises a variance that is right on average, for a new motion.
+    """Returns the factor, at least 1, from the average variance of the errors to the variance for a new motion.
 
-    With s_m the mean square of the relative residuals of motion m, of M, and n_m their effective samples,
+    With s_m the mean square of the relative residuals of motion m of M, and n_m the effective samples,
 
         (1 + sqrt((1 + 1 / M) (var(s) - chance))) (t / z)²    where var(s) > chance
 
-    The first factor is one standard deviation of a new motion's s above their mean. In the second, t and z are the
-    97.5 % quantiles of Student's distribution with M - 1 degrees of freedom and of the normal one, because M motions
-    estimate the variance with few degrees of freedom. By chance alone the variance of s is 2 / n for normal
-    residuals, and an estimate of it from M motions has the relative error e; chance is 2 / n (1 + 2 e) with
+    The first factor is the mean of s plus one standard deviation for a new motion. The second accounts for estimating a
+    spread from few motions: t and z are the 97.5 % quantiles of Student's distribution with M - 1 degrees of freedom
+    and of the normal distribution. Chance alone gives s a variance of 2 / n for normal residuals, and its estimate from
+    M motions has the relative error e, so that chance is 2 / n (1 + 2 e) with
 
         e² = 2 / (M - 1) + 12 / (n M)
 
     Args:
         relative: residuals in units of their predicted standard deviations.
-        trajectory: motion of every residual; with fewer than three motions the factor is 1.
+        trajectory: motion of each residual; the factor is 1 for fewer than three motions.
     """
     motions = [relative[trajectory == index] for index in np.unique(trajectory)]
     if len(motions) < 3:
@@ -217,9 +217,9 @@ def scatter(relative: SampleVector, trajectory: np.ndarray) -> float:
 
 
 def effective_samples(residual: SampleVector, trajectory: np.ndarray) -> float:
-    """Effective number of independent samples for the variance: N / (1 + 2 sum of squared autocorrelations).
+    """Returns the effective number of samples for a variance: N / (1 + 2 sum of squared autocorrelations).
 
-    The sum ends at the first lag whose autocorrelation is below 0.05 (Bayley and Hammersley 1946, for the squares).
+    The sum ends at the first lag with an autocorrelation below 0.05 (Bayley and Hammersley 1946, for the squares).
     """
     order = np.argsort(trajectory, kind="stable")
     residual, trajectory = residual[order], trajectory[order]
@@ -242,7 +242,7 @@ def thin(data: Trajectories, most: int) -> Trajectories:
 def _calibrate(
     sd: np.ndarray, residual: np.ndarray, variances: np.ndarray, trajectory: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Calibrated noise and inflation of every joint, and the mean negative log-likelihood."""
+    """Returns the calibrated noise and inflation of each joint, and the mean negative log-likelihood."""
     joints = [
         calibration(r, float(noise), variance, effective_samples(r / np.sqrt(noise**2 + variance), trajectory))
         for r, noise, variance in zip(residual.T, sd, variances.T, strict=True)

@@ -1,7 +1,7 @@
-"""Errors of a model on trajectories, how often they lie within its bands, and the definiteness of its mass matrices.
+"""Errors of a model on trajectories, coverage of its bands, and definiteness of its mass matrices.
 
-The band of level p about a prediction has the half width z_p sd, where a standard normal variable lies between -z_p and
-z_p with probability p: 1.96 sd for 95 %. A kinetic energy has a positive definite M; a black-box network may not.
+The band of level p around a prediction has the half width z_p sd, where a standard normal variable lies between -z_p
+and z_p with probability p: 1.96 sd for 95 %. A kinetic energy has a positive definite M; a black-box network may not.
 """
 
 from collections.abc import Callable
@@ -32,10 +32,10 @@ def prediction_program(
 ) -> Callable[[Any, tuple[Any, ...]], dict[str, Array]]:
     """Returns (parameters, samples) -> predictions of the system with these parameters, for `jax.jit`.
 
-    Every sample has `tau`, `qdd` and the parts of the torque, [N, d]. With recorded momenta and a Hamiltonian (`H`, or
-    that of a system in momenta) also `tau_from_momenta` = pd + dH/dq + friction, as published for such models.
+    The predictions are `tau`, `qdd` and the parts of the torque, [N, d]. With recorded momenta and a Hamiltonian (`H`,
+    or the system's own) they include `tau_from_momenta` = pd + dH/dq + friction, as published for such models.
 
-    Parameters are arguments, not constants: one compilation serves every seed. Devices of a mesh share the samples.
+    Parameters are arguments, not constants, so one compilation serves every seed. A mesh splits the samples.
     """
 
     def answers(parameters: Any, samples: tuple[Any, ...]) -> dict[str, Array]:
@@ -68,17 +68,17 @@ def samples_of(data: Trajectories, dtype) -> tuple[Any, ...]:
 
 
 def as_arrays(answers: dict[str, Array]) -> dict[str, np.ndarray]:
-    """Returns the answers of a `prediction_program` in float64."""
+    """Converts the results of a `prediction_program` to float64."""
     return {key: np.asarray(array, np.float64) for key, array in answers.items()}
 
 
 def errors(predicted: dict[str, np.ndarray], data: Trajectories) -> dict[str, float]:
-    """Returns mean squared errors over samples, summed over joints (the published metric; SI units squared).
+    """Returns squared errors in SI units, summed over joints and averaged over samples (the published metric).
 
-    `torque_mse`, `forward_mse` (of qdd), `power_mse` (of qdᵀ tau, which is dE/dt without friction) and, if the data
-    have the true parts, `inertial_mse`, `coriolis_mse`, `gravity_mse`. `torque_from_momenta_mse` of a Hamiltonian
-    includes the error of the recorded pd. Its lower bound is the value of the true plant (4.4e-6 on the published test
-    letters, whose pd are difference quotients).
+    The entries are `torque_mse`, `forward_mse` (of qdd), `power_mse` (of qdᵀ tau, which is dE/dt without friction) and,
+    if the data have the true parts, `inertial_mse`, `coriolis_mse`, `gravity_mse`. A Hamiltonian model adds
+    `torque_from_momenta_mse`, which includes the error of the recorded pd. Its lower bound is the error of the true
+    plant (4.4e-6 on the published test letters, where pd are difference quotients).
     """
     torque_error = predicted["tau"] - data.tau
     result = {
@@ -98,7 +98,7 @@ def errors(predicted: dict[str, np.ndarray], data: Trajectories) -> dict[str, fl
 def normalised_error(
     predicted: Float[np.ndarray, "N d"], measured: Float[np.ndarray, "N d"]
 ) -> Float[np.ndarray, " d"]:
-    """Returns the nMSE of the joints: mean squared error over the variance of the measurements; NaN if that is zero."""
+    """Returns the nMSE of each joint: mean squared error over the variance of the measurements (NaN for a constant)."""
     variance = np.var(measured, axis=0)
     return np.mean((predicted - measured) ** 2, axis=0) / np.where(variance > 0, variance, np.nan)
 
@@ -116,7 +116,7 @@ def half_width(level: float) -> float:
 
 
 def coverage(error: Any, std: Any, levels: tuple[float, ...] = LEVELS) -> Float[np.ndarray, "n d"]:
-    """Returns the shares of errors within z_p standard deviations, by level and joint.
+    """Returns the fraction of errors within z_p standard deviations, by level and joint.
 
     Args:
         error: predicted minus measured, [N, d].
@@ -135,14 +135,14 @@ def coverage(error: Any, std: Any, levels: tuple[float, ...] = LEVELS) -> Float[
 def definiteness(
     dynamics: Dynamics | InverseForward, q: Float[Array | np.ndarray, "N d"], qd: Float[Array | np.ndarray, "N d"]
 ) -> tuple[float, float, float]:
-    """Evaluates the eigenvalues of the mass matrix at N states. It only reports; nothing is repaired.
+    """Evaluates the eigenvalues of the mass matrix at N states. Reports only; does not repair the model.
 
-    Returns the smallest eigenvalue in the unit of M, NaN if a matrix is not finite; the share of states, 0 to 1, whose
-    M is indefinite, singular to rounding, or not finite; and the largest ratio of the eigenvalues' magnitudes, infinite
-    if M is singular or not finite.
+    Returns three numbers: the smallest eigenvalue in the unit of M (NaN if a matrix is not finite); the fraction of
+    states, 0 to 1, with an indefinite, numerically singular or non-finite M; and the largest condition number (infinite
+    if M is singular or not finite).
 
-    An eigenvalue counts as positive if it exceeds d times the rounding unit times the largest magnitude of its matrix.
-    A Hamiltonian model has M = H_pp⁻¹, which is not finite where H_pp is singular.
+    An eigenvalue counts as positive if it exceeds d times the rounding unit times the largest one of its matrix. A
+    Hamiltonian model has M = H_pp⁻¹, which is not finite where H_pp is singular.
 
     Raises:
         InputError: the model has no mass matrix, or there are no states.

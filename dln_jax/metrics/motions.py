@@ -1,4 +1,4 @@
-"""Predictions of motions under recorded torques, the time until they fail, and their energy.
+"""Predicted motions under recorded torques: the time until they fail, and their energy.
 
     VPT = first t with sum_j (q_j - q_hat_j)² / var(q_j) >= THRESHOLD        (valid prediction time)
     E(t) - E(0) = work of tau - work lost to friction                        (energy balance)
@@ -6,8 +6,8 @@
 Motions start from a recorded state; `metrics.predictions` fits the start to measured coordinates.
 
 Protocol: Lutter and Peters, "Combining physics and deep learning to learn continuous-time dynamics models" (2021),
-integrate by RK4 at a twentieth of the samples' spacing, with the torque held over each sample. But a recorded torque is
-a sample of a smooth function, so even the true plant deviates under held torques; interpolation is more accurate.
+integrate by RK4 with twenty steps per sample and hold the torque over each sample. A recorded torque, however, is a
+sample of a smooth function, so even the true plant deviates under held torques. Interpolation is more accurate.
 """
 
 import functools
@@ -28,20 +28,21 @@ from dln_jax.metrics.phase_space import finite_or_infinite
 from dln_jax.types import InputError, Vector, require_positive
 
 TORQUES: tuple[Torque, ...] = ("held", "interpolated")
-"""Kinds of torque between two samples; all are compared."""
+"""Torque between two samples; both kinds are evaluated."""
 SUBSTEPS = 20
 """RK4 steps per sample, as published."""
 THRESHOLD = 1e-2
-"""Squared error over the variance, summed over coordinates, at which a prediction has failed, as published."""
+"""A prediction has failed if its squared error over the variance, summed over coordinates, reaches this value, as
+published."""
 
 
 class Motion(NamedTuple):
-    """A predicted motion at the times of the recorded one; several add a leading axis [K]."""
+    """A predicted motion at the times of the recorded one; K motions add a leading axis."""
 
     q: Float[Array | np.ndarray, "*K T d"]
     qd: Float[Array | np.ndarray, "*K T d"]
     work: Float[Array | np.ndarray, "*K T"]
-    """Energy supplied by tau minus the loss to friction since the start, in J."""
+    """Work of tau since the start minus the energy lost to friction, J."""
 
 
 def follow(
@@ -56,10 +57,11 @@ def follow(
 ) -> Motion:
     """Integrates the motion from (q0, qd0) under torques by RK4; `vmap` it over trajectories.
 
-    The torque is tau[k] + slopes[k] (t - t[k]) from t[k] on, with slopes from `torque_slopes`. Times are in s, with any
-    spacing; a repeated time repeats the state. There are `substeps` RK4 steps per sample.
+    The torque is tau[k] + slopes[k] (t - t[k]) from t[k] on, with slopes from `torque_slopes`. Times in s may have any
+    spacing; a repeated time repeats the state. Each sample takes `substeps` RK4 steps.
 
-    Raises InputError if `substeps` is not positive.
+    Raises:
+        InputError: `substeps` is not positive.
     """
     require_positive(substeps=substeps)
 
@@ -78,8 +80,8 @@ def motion_program(
 ) -> Callable[[Any, tuple[Array, ...]], tuple[Motion, Array | None]]:
     """Returns (parameters, records) -> motions and their energies, for `jax.jit`; leading axes [TORQUES, trajectories].
 
-    Energies, in J, are those of the predicting system at its own states; `None` for a system without energy. Parameters
-    are arguments of the program, not constants in it, so one compilation serves every seed.
+    Energies (J) are computed by the predicting system at its own states; `None` for a system without energy. Parameters
+    are arguments, not constants, so one compilation serves every seed.
     """
 
     def motions(parameters: Any, records: tuple[Array, ...]) -> tuple[Motion, Array | None]:
@@ -100,8 +102,8 @@ def motion_program(
 def records_of(data: Trajectories, dtype: DTypeLike | None) -> tuple[Array, ...]:
     """Returns the records of K trajectories for a `motion_program`, in `dtype` (JAX's default if `None`).
 
-    These are the first q and qd [K, d], tau [K, T, d], and the times [K, T] since the start of the trajectory, in s.
-    They are padded to one length T by repeating the last samples.
+    The records are the first q and qd [K, d], tau [K, T, d], and the times [K, T] since the start of the trajectory in
+    s. The last samples are repeated to pad all trajectories to one length T.
 
     Raises:
         InputError: a trajectory has a single sample.
@@ -143,9 +145,10 @@ def valid_prediction_time(
 
 
 def valid_prediction_times(data: Trajectories, motions: list[Motion]) -> Float[np.ndarray, " K"]:
-    """Returns the trajectories' valid prediction times in s; the variance of q_j is over all samples of the data.
+    """Returns the valid prediction time of each trajectory in s, with the variance of q_j over all samples of the data.
 
-    Raises InputError if a coordinate is the same in all samples.
+    Raises:
+        InputError: a coordinate is the same in all samples.
     """
     variance = _variance(data.q, "q")
     return np.array(
@@ -159,8 +162,10 @@ def valid_prediction_times(data: Trajectories, motions: list[Motion]) -> Float[n
 def normalised_state_error(data: Trajectories, motions: list[Motion]) -> float:
     """Returns the root mean square of (q - q_hat) / sd(q_j) and (qd - qd_hat) / sd(qd_j) over samples and coordinates.
 
-    1 is the error of a constant guess; infinite if a prediction is not finite. Raises InputError if a coordinate or
-    rate is the same in all samples.
+    A constant guess has an error of 1. The error is infinite if a prediction is not finite.
+
+    Raises:
+        InputError: a coordinate or rate is the same in all samples.
     """
     errors, samples = [], np.concatenate(_samples(data))
     for key in ("q", "qd"):
@@ -171,15 +176,17 @@ def normalised_state_error(data: Trajectories, motions: list[Motion]) -> float:
 
 
 def metrics_of_motions(motions: Motion, energies: Array | None, data: Trajectories) -> dict[str, float]:
-    """Returns means over the trajectories of the motions and energies of a `motion_program`, for both kinds of torque.
+    """Returns means over trajectories for the motions and energies of a `motion_program`, with both kinds of torque.
 
-    `vpt_seconds` (torque held, as published), `vpt_interpolated_seconds` and `rollout_seconds` (the duration, which
-    bounds them). For the interpolated motions, which are more accurate, also `normalised_state_error` and, if the
-    system has an energy, `energy_error_j`: the mean over all samples of |E(t) - E(0) - work(t)|, infinite if a
-    prediction is not finite. It shows the integration error, and whether the forward model is consistent with that
-    energy, but not whether the energy is right. The figures of the true plant bound a model's.
+    The entries are `vpt_seconds` (torque held, as published), `vpt_interpolated_seconds` and `rollout_seconds` (the
+    duration, an upper bound of both). The interpolated motions, which are more accurate, also give
+    `normalised_state_error` and, if the system has an energy, `energy_error_j`: the mean over all samples of
+    |E(t) - E(0) - work(t)|, infinite if a prediction is not finite. It measures the integration error and whether the
+    forward model is consistent with the energy, but not whether the energy is correct. The numbers of the true plant
+    are the best that a model can reach.
 
-    Raises InputError if a coordinate never changes.
+    Raises:
+        InputError: a coordinate never changes.
     """
     held, interpolated = by_trajectory(motions, data).values()
     metrics = {

@@ -1,8 +1,8 @@
-"""Errors of a model of a phase space: of its field at test states, and of its predicted motions.
+"""Errors of a phase-space model: of its field at test states, and of its predicted motions.
 
     test loss        mean over samples and components of (rates - measured rates)², as published
-    clean field      the same against the exact field at the same noisy states, which distinguishes models
-    energy           mean over starts and times of (H(x_hat(t)) - H(x(t)))², H the true one
+    clean field      the same relative to the exact field at the same noisy states, which distinguishes models
+    energy           mean over starts and times of (H(x_hat(t)) - H(x(t)))², with the true H
     rollout          mean over starts, times and components of (x_hat(t) - x(t))²
 
 Standard errors are over starts. A few chaotic motions dominate means, so medians over starts are reported too. A motion
@@ -41,7 +41,7 @@ class Motions(NamedTuple):
 def field_rates(
     model: Model, parameters: Parameters, q: Float[np.ndarray, "N d"], p: Float[np.ndarray, "N d"]
 ) -> tuple[Float[np.ndarray, "N d"], Float[np.ndarray, "N d"]]:
-    """Returns the rates (qd, pd) of states."""
+    """Returns the rates (qd, pd) at the states."""
     qd, pd = _rates(model, parameters, jnp.asarray(q), jnp.asarray(p))
     return np.asarray(qd), np.asarray(pd)
 
@@ -80,7 +80,7 @@ def energies(H: Hamiltonian, motions: Motions) -> Float[np.ndarray, "K T"]:
 
 
 def finite_or_infinite(values: np.ndarray | np.floating) -> np.ndarray:
-    """Replaces values that are not finite by infinity, so that a NaN never counts as a small error."""
+    """Replaces NaN by infinity, so that it never counts as a small error."""
     return np.where(np.isfinite(values), values, np.inf)
 
 
@@ -114,7 +114,7 @@ def motion_errors(
 ) -> dict[str, float]:
     """Returns `rollout_mse`, `energy_mse` if H is known, and `published_energy_mse` if that energy differs from H.
 
-    All are reported by `summary`, over all motions of all entries, whose times may differ.
+    `summary` reports each over all motions of all entries; the times may differ between entries.
     """
 
     def over_all(name: str, error: Callable[[Motions, Motions], np.ndarray]) -> dict[str, float]:
@@ -129,7 +129,7 @@ def motion_errors(
 def free_motions(
     states: Float[np.ndarray, "K T n"], joints: int, *, fitted: int, quarter: int
 ) -> tuple[Float[np.ndarray, "K 1 n"], Float[np.ndarray, "K T n"]]:
-    """Returns two guesses without a model from the last of the `fitted` samples on: rest, and motion without forces.
+    """Returns two guesses without a model, rest and force-free motion, from the last of the `fitted` samples on.
 
     Args:
         states: measured states; the first `joints` columns are coordinates, the others momenta.

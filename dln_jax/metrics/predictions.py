@@ -1,6 +1,6 @@
-"""Predictions of measured motions, which start from a state that is fitted to their first samples.
+"""Predictions of measured motions, started from a state fitted to their first samples.
 
-The valid prediction time (see `metrics.motions`) counts from the last of these.
+The valid prediction time (see `metrics.motions`) counts from the last fitted sample.
 
 A perturbation e of the initial state grows to e exp(lambda t), with lambda = ln |dx(T) / dx(0)| / T. Predictions of
 chaotic motions are measured in Lyapunov times, 1 / lambda: a more accurate model extends them only by the logarithm of
@@ -40,12 +40,12 @@ class Predictions(NamedTuple):
 def cut_recordings(data: Trajectories, samples: int, *, fitted: int) -> MeasuredWindows:
     """Cuts recordings of free motions to predict; gaps are filled with unmeasured times of weight 0.
 
-    An initial state is fitted to `fitted` consecutive samples without a gap. A recording is predicted from the first
-    such place, for `samples` median time steps or until it ends. Further predictions start at intervals of half that
-    length, as long as `samples` steps remain. Shorter segments repeat their last time, with weight 0.
+    The initial state is fitted to `fitted` consecutive samples without a gap. The first prediction starts at the first
+    such place and lasts `samples` median time steps or until the recording ends. Further predictions start every half
+    of that length while `samples` steps remain. Shorter segments repeat their last time, with weight 0.
 
     Raises:
-        InputError: no recording has more than `fitted` consecutive samples, so that there is one to predict.
+        InputError: no recording has a sample to predict after `fitted` consecutive ones.
     """
     recordings = []
     for index in np.unique(data.trajectory):
@@ -84,16 +84,16 @@ def cut_segments(data: Trajectories, samples: int, *, every: int) -> MeasuredWin
 
 
 def grid_places(t: Float[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
-    """Returns the samples' indices on a grid of their own time steps; within a gap, steps are at most the median."""
+    """Returns the index of each sample on a grid of time steps; within a gap, steps are at most the median step."""
     steps = np.diff(t)
     median = np.median(steps) if len(steps) else 1.0
-    # Rounding of the times must not add a step to a gap of an integer number of steps.
+    # Rounding of the times must not add a step to a gap of a whole number of steps.
     counts = np.where(steps > GAP * median, np.ceil(steps / median - 1e-6), 1).astype(int)
     return np.concatenate([[0], np.cumsum(counts)])
 
 
 def on_grid(t: Float[np.ndarray, " N"], q: Float[np.ndarray, "N d"], qd: Float[np.ndarray, "N d"]) -> MeasuredWindows:
-    """Returns one free motion on the grid of its places, as a window; places of weight 0 repeat the previous sample."""
+    """Returns one free motion on its grid as a window; points without a sample repeat the last one with weight 0."""
     place = grid_places(t)
     grid = np.arange(place[-1] + 1)
     held = np.searchsorted(place, grid, side="right") - 1
@@ -123,10 +123,10 @@ def predict_measured(
     Torques are interpolated between samples.
 
     Args:
-        model: a model of any energies, or of accelerations.
+        model: any model of energies or accelerations.
         fitted: number of samples for fitting the initial state, at least 2.
         substeps: RK4 steps between two samples.
-        momenta: whether the model is a flow of (q, p), without torques, with p close to qd; its p is returned as qd.
+        momenta: whether the model is a flow of (q, p) without torques and with p close to qd; p is returned as qd.
 
     Raises:
         InputError: `fitted` is out of range.
@@ -146,7 +146,7 @@ def valid_times(
     fitted: int,
     variance: Float[np.ndarray, " d"],
 ) -> Float[np.ndarray, " W"]:
-    """Returns the segments' valid prediction times in s from the last fitted sample on, at measured samples."""
+    """Returns the valid prediction time of each segment in s from the last fitted sample, by measured samples."""
     measured = (segments.weight > 0) & (np.arange(segments.t.shape[1]) >= fitted - 1)
     return np.array(
         [
@@ -163,10 +163,10 @@ def prediction_metrics(
     fitted: int,
     variance: Float[np.ndarray, " d"],
 ) -> dict[str, float]:
-    """Returns means over the segments, the median valid prediction time, and upper bounds on these times.
+    """Returns mean and median valid prediction times over the segments, with their upper bounds.
 
-    `vpt_seconds`, `vpt_median_seconds`, `predicted_seconds` (the duration), `vpt_lyapunov` (in Lyapunov times, if
-    motions diverge) and `lyapunov_seconds`, by the model's own growth of small changes; `energy_drift`.
+    The entries are `vpt_seconds`, `vpt_median_seconds`, `predicted_seconds` (the duration), `energy_drift` and, if
+    motions diverge, `vpt_lyapunov` (in Lyapunov times) and `lyapunov_seconds`. The model defines the Lyapunov time.
     """
     times = valid_times(segments, predicted, fitted=fitted, variance=variance)
     growth = float(np.mean(predicted.growth))

@@ -1,4 +1,4 @@
-"""report.json: one number per row, with its reference or bound, and the conditions of the measurement."""
+"""Writes report.json: one number per row with its reference or bound, and the conditions of the measurement."""
 
 import datetime
 import importlib.metadata
@@ -17,7 +17,7 @@ PACKAGES = ("dln-jax", "jax", "jaxlib", "dm-haiku", "optax", "numpy", "diffrax")
 
 
 class Row(NamedTuple):
-    """One measured number; names are stable and lower case, so that anyone can compare two runs."""
+    """One measured number; names are stable and lower case, so that runs can be compared."""
 
     case: str
     quantity: str
@@ -29,7 +29,7 @@ class Row(NamedTuple):
     at_least: bool = False
     """Whether the bound is a lower bound."""
     expected: str = ""
-    """The expectation in words, with the origin of the bound."""
+    """The expected result and the origin of the bound, in words."""
 
     @property
     def passed(self) -> bool | None:
@@ -40,7 +40,7 @@ class Row(NamedTuple):
 
 
 def conditions(**facts: Any) -> dict[str, Any]:
-    """Returns machine, versions, threads, command and date, and all keywords (dtype, seeds, ...)."""
+    """Returns machine, versions, threads, command, date and all keywords (dtype, seeds, ...)."""
     return {
         "machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()} {platform.machine()}",
         "device": str(jax.devices()[0]),
@@ -53,7 +53,7 @@ def conditions(**facts: Any) -> dict[str, Any]:
 
 
 def write_report(path: Path, rows: Sequence[Row], facts: Mapping[str, Any]) -> None:
-    """Writes conditions (with the expectations of rows) and rows as JSON; a value that is not finite becomes null."""
+    """Writes the conditions, with the expectations of rows, and the rows as JSON; infinities and NaN become null."""
     listed = [{**dict(zip(Row._fields[:6], row, strict=False)), "pass": row.passed} for row in rows]
     words = {f"{row.case} {row.quantity}": row.expected for row in rows if row.expected}
     write_json(path, {"conditions": {**facts, **({"expected": words} if words else {})}, "rows": listed})

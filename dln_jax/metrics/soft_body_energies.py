@@ -20,7 +20,7 @@ def motion_energies(
     v: Float[Array, "T n dim"],
     control: Float[Array, "T k"] | None = None,
 ) -> dict[str, Float[np.ndarray, " T"]]:
-    """Returns kinetic energy, the energies of the terms by name, and their total, in J, at the moments of a motion.
+    """Returns the kinetic energy, the energy of each term, and their total, all in J, at each time of a motion.
 
     Gravity has zero potential at the origin. Friction stores nothing.
     """

@@ -10,16 +10,16 @@ the error of the robot's own file. A joint is:
                   both FAR_FROM_NOISE n and COUNTS v: the model lacks something, or its parameters are not determined
     unseen        its torque does not rise above its noise (n >= v / 2) and e <= NOISE n: no conclusion
 
-A torque that does not vary, such as that of a passive joint, is judged in units of the mean square of all torques.
+A constant torque, for example of a passive joint, is judged in units of the mean square of all torques.
 
-A refusal becomes a doubt if means over a quarter of the torque's period are explained, with less than HALF of the share
-of single samples: such errors come from noise of accelerations or torques, and from no wrong sign, order or unit.
+A fit is doubtful instead of refused if averaging over a quarter of the torque's period leaves less than HALF of the
+unexplained share. Such errors come from noisy accelerations or torques, not from a wrong sign, order or unit.
 
-A predicted motion escapes if a state is not finite, or if a momentum or a position is further from zero than `RANGE`
-times the farthest measured one; angles may grow, since a pendulum can turn over. The error of a motion is the mean
-square over one period of the system, after the samples that its start was fitted to, and over measured columns alone;
-chaotic motions later diverge from any model. Its unit is the smallest error of a guess without a model: rest, no force,
-the mean of the test motions, or the variance of the data:
+A predicted motion escapes if a state is not finite, or if a momentum or position exceeds `RANGE` times the largest
+measured magnitude. Angles may grow, since a pendulum can turn over. The error of a motion is the mean square over one
+period of the system, over measured columns, after the samples to which the start was fitted. Chaotic motions later
+diverge from any model. The unit of the error is the smallest error of four guesses without a model: rest, no force, the
+mean of the test motions, or the variance of the data:
 
     refused    a motion escapes, or the median error exceeds FAILED (an rms error of half the unit)
     doubtful   it exceeds UNEXPLAINED; MOTION_NOISE times the variance of the noise is added to both limits, but a
@@ -42,23 +42,23 @@ Level = Literal["good", "doubtful", "refused"]
 LEVELS: tuple[Level, ...] = ("good", "doubtful", "refused")
 """Levels in the order of their numbers in metrics.json: 0, 1 and 2."""
 UNEXPLAINED, FAILED = 0.05, 0.25
-"""Share of a torque's variance that a good model may leave unexplained in any joint (an rms error of 22 %), and mean
-share over all joints at which the fit is refused (50 %)."""
+"""Largest unexplained fraction of a joint's torque variance in a good fit (an rms error of 22 %), and mean fraction of
+all joints at which a fit is refused (50 %)."""
 NOISE = 2.0
-"""Errors up to this multiple of the noise variance count as noise, because that variance is itself an estimate."""
+"""Errors up to this multiple of the noise variance count as noise, because the variance is an estimate."""
 FAR_FROM_NOISE, COUNTS = 4.0, 0.005
-"""A fit is doubtful if a joint's error exceeds this multiple of its noise variance, and this share of the torque's
+"""A fit is doubtful if a joint's error exceeds this multiple of its noise variance and this fraction of the torque's
 variance (an rms error of 7 %)."""
 WORSE, MUCH_WORSE = 0.01, 2.0
-"""A fit is worse than the robot's file if its mean nMSE is larger by the first number; it is also refused if it is
+"""A fit is worse than the robot's file if its mean nMSE is larger by the first number, and is refused if it is also
 larger by the second as a factor."""
 CONSTANT = 1e-12
-"""A torque is constant if its variance is below this share of the mean square of all torques."""
+"""A torque is constant if its variance is below this fraction of the mean square of all torques."""
 
 RANGE, MOTION_NOISE, HALF = 10.0, 4.0, 0.5
-"""Distance relative to the data beyond which a motion has escaped; factor on the noise: noise in the measured initial
-state moves a motion as far as the noise in the measurements that it is compared with, and this may grow; and largest
-error of a good model relative to a guess, whatever the noise."""
+"""Distance relative to the data beyond which a motion has escaped; factor on the noise variance, which counts twice
+because the measured initial state is noisy too, and may grow; largest error of a good model relative to a guess, at any
+noise."""
 
 
 class Verdict(NamedTuple):
@@ -72,7 +72,7 @@ class Verdict(NamedTuple):
 
     @property
     def number(self) -> int:
-        """0 good, 1 doubtful, 2 refused: the entry `verdict` of metrics.json."""
+        """The entry `verdict` of metrics.json: 0 good, 1 doubtful, 2 refused."""
         return LEVELS.index(self.level)
 
     @property
@@ -87,15 +87,15 @@ class HeldOut(NamedTuple):
     error: Float[np.ndarray, " d"]
     """Error of the model's torques."""
     mean: Float[np.ndarray, " d"]
-    """Error of predicting the mean: the torque's variance, over the whole recording if its blocks are held out."""
+    """Error of predicting the mean, which is the torque's variance; of the whole recording if blocks are held out."""
     zero: Float[np.ndarray, " d"]
     """Error of predicting zero."""
     noise: Float[np.ndarray, " d"] | None = None
-    """Variance of the measured torque's noise, if it was estimated."""
+    """Noise variance of the measured torque, if it was estimated."""
     file: Float[np.ndarray, " d"] | None = None
-    """Error of the torques of the robot's own file, if there is one."""
+    """Error of the torques that the robot's file predicts, if there is one."""
     slow: Float[np.ndarray, " d"] | None = None
-    """Error of means over a quarter of the torques' period, over their variance; `None` if unknown."""
+    """Error of averages over a quarter of the torques' period, relative to their variance; `None` if unknown."""
 
     @property
     def unit(self) -> Float[np.ndarray, " d"]:
@@ -116,10 +116,11 @@ def held_out(
     Args:
         predicted: torques of the model.
         measured: torques of motions that the model has not seen.
-        noise: standard deviations of the torques' noise, as from `noise_of`; not finite if unknown.
-        file: torques of the robot's own file.
-        recording: torques of the recording of which the held-out samples are blocks of time; their own variance may be
-            small by chance.
+        noise: standard deviation of each torque's noise, for example from `data.encoders.sampling.noise_of`; NaN if
+            unknown.
+        file: torques that the robot's file predicts.
+        recording: torques of the whole recording, if the held-out samples are blocks of it; the variance of single
+            blocks may be small by chance.
 
     Raises:
         InputError: there are no samples.
@@ -145,7 +146,7 @@ def judge(errors: HeldOut, names: Sequence[str] | None = None, *, quantity: str 
     Args:
         errors: mean squares of the joints.
         names: names of the joints; by default joint 1, joint 2, ...
-        quantity: name of the quantity, for the reason.
+        quantity: name of the quantity in the reason.
     """
     names = [f"joint {k + 1}" for k in range(len(errors.error))] if names is None else names
     if not errors.zero.any():
@@ -209,11 +210,11 @@ def judge_motions(
         predicted: motions of the model.
         truth: measured or exact motions at the same times.
         size: standard deviation of q and p in the data.
-        bounded: mask of q and p that cannot grow without limit: all but angles.
+        bounded: mask of q and p that must stay bounded: everything except angles.
         noise: standard deviation of the measurements of q and p, if known.
-        measured: mask of q and p that were measured; others do not count (default: all).
-        fitted: number of first samples that the start of a prediction saw; they do not count.
-        rates: shares of the variance of measured rates that the model leaves unexplained at test states.
+        measured: mask of the measured q and p; only these count (default: all).
+        fitted: number of first samples to which the start was fitted; they do not count.
+        rates: fractions of the variance of measured rates that the model leaves unexplained at test states.
     """
     remedy = "state the plant's --needs, try another --model, or record more motions"
     counts = np.ones(len(size), bool) if measured is None else measured
@@ -253,10 +254,10 @@ def judge_motions(
 
 
 def worst(first: Verdict, *others: Verdict, causes: Sequence[str] = ()) -> Verdict:
-    """Returns the most severe of several verdicts; of equal ones that are not good, all reasons and remedies.
+    """Returns the most severe verdict, and joins the reasons and remedies of equally severe ones.
 
     Args:
-        causes: faults of the log, which belong to the reasons of a verdict that is not good.
+        causes: faults of the log, added to the reasons unless the verdict is good.
     """
     every = [first, *others]
     level = LEVELS[max(verdict.number for verdict in every)]
@@ -269,7 +270,7 @@ def worst(first: Verdict, *others: Verdict, causes: Sequence[str] = ()) -> Verdi
 
 
 def verdict_metrics(errors: HeldOut, verdict: Verdict) -> dict[str, float | int]:
-    """Returns entries of metrics.json: the verdict as a number, and the mean nMSE of the comparisons."""
+    """Returns entries of metrics.json: the verdict as a number, and the mean nMSE of each comparison."""
     compared = {"zero": errors.zero, "noise": errors.noise, "file": errors.file}
     means = {f"{name}_nmse": float(np.mean(e / errors.unit)) for name, e in compared.items() if e is not None}
     return {"verdict": verdict.number, **means}
@@ -289,10 +290,9 @@ def _listed(names: Sequence[str], chosen: np.ndarray) -> str:
 
 
 def quarter_period(states: Float[np.ndarray, "K T n"], bounded: Bool[np.ndarray, " n"]) -> int:
-    """Returns the system's own time in samples: the first lag at which motions no longer correlate with themselves.
+    """Returns a quarter period in samples: the first lag at which the autocorrelation of the motions is not positive.
 
-    It is a quarter of the period of an oscillation. Every column counts alike; angles, which may turn over, enter by
-    their cosine and sine. Noise that is independent between samples does not matter.
+    All columns have equal weight. Angles, which may turn over, enter as cosine and sine. White noise has no influence.
     """
     parts = np.stack([np.where(bounded, states, np.cos(states)), np.where(bounded, 0.0, np.sin(states))])
     about = parts - parts.mean(axis=2, keepdims=True)

@@ -34,25 +34,37 @@ def train(
     say: Callable[[str], None] = lambda line: None,
     **settings: Any,
 ) -> Fit:
-    """Fits a model of dynamics to a log, and evaluates it on held-out motions.
+    """Fits a model of dynamics to a log and evaluates it on held-out motions.
 
-        fit = dln_jax.train(dln_jax.read_log("mine.csv"), seconds=60)
-        fit.report.verdict, fit.report.metrics["torque_mse"], fit.dynamics.inverse_dynamics(q, qd, qdd)
-        fit.save("runs/mine")
+    The fit minimises the squared torque error of tau = M(q) qdd + c(q, qd) + g(q) + friction, each joint in units of
+    its torque's standard deviation. `fit.report` has metrics and verdict, and `fit.save(folder)` stores the model.
 
     Args:
         log: from `read_log`; or trajectories, or a file.
-        model: "auto" for model selection, or one of `learning.fits.settings.WAYS`.
+        model: "auto" for model selection, or a name in `learning.fits.settings.WAYS`.
         test: test trajectories, as for `data.log.split_log`.
-        seed: seed of parameters, shuffling and the validation split.
-        seconds: time limit of the fit.
-        uncertainty: estimate the uncertainty of the torques.
-        say: takes lines on the progress, such as `print`.
-        settings: fields of the class of the model in `learning.fits.settings`, such as `width`. The `optimizer` of a
-            network may be any of optax: `optimizer=optax.adam(3e-4), steps=5000`.
+        seed: seed for parameters, shuffling and the validation split.
+        seconds: time limit of the fit, s.
+        uncertainty: estimate the standard deviation of the torques.
+        say: takes lines of progress; pass `print` to show them.
+        settings: fields of the model's class in `learning.fits.settings`, such as `width`. The `optimizer` of a network
+            may be any optimiser of optax: `optimizer=optax.adam(3e-4), steps=5000`.
+
+    Returns:
+        The fitted model, its functions as in a loaded run, the training history and the report.
 
     Raises:
-        InputError: JAX without float64, an unknown model or setting, or data that the model cannot be fitted to.
+        InputError: JAX without float64, an unknown model or setting, or data that do not suit the model.
+
+    Example:
+        >>> import jax
+        >>> import dln_jax
+        >>> from dln_jax.scenes.datasets.generators import uniform
+        >>> from dln_jax.scenes.pendulums import pendulum
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> fit = dln_jax.train(uniform(pendulum(), samples=200), "trigonometric", degree=1, uncertainty=False)
+        >>> print(fit.report.verdict.level, fit.dynamics.inverse_dynamics([0.0], [0.0], [2.0]).round(4))  # N m
+        good [2.]
     """
     from dln_jax.runs.evaluation import evaluate as evaluate_fit  # draws, which the import of dln_jax need not
 
@@ -81,20 +93,42 @@ def identify(
     test: str | None = None,
     say: Callable[[str], None] = lambda line: None,
 ) -> Fit:
-    """Identifies the bodies and the friction of a robot from a log, and evaluates them on held-out motions.
+    """Identifies inertias and friction of a robot from a log, and evaluates the result on held-out motions.
 
-        fit = dln_jax.identify("arm.urdf", dln_jax.read_log("mine.csv", robot="arm.urdf"))
-
-    The command `identify` also fits motions, coupled motors and temperature, and writes the robot's file.
+    The torques are linear in the inertial and friction parameters, tau = Phi(q, qd, qdd) theta (Atkeson, An and
+    Hollerbach 1986), so the fit is a weighted least-squares problem. The command `identify` also fits motions, coupled
+    motors and temperature, and writes a robot file.
 
     Args:
         robot: the robot, or its URDF or MJCF file.
-        log: from `read_log`; or trajectories, or a file, whose joints are matched by name.
+        log: from `read_log`; or trajectories, or a file. Joints are matched by name.
         test: test trajectories, as for `data.log.split_log`.
-        say: takes lines on the progress.
+        say: takes lines of progress; pass `print` to show them.
+
+    Returns:
+        The fitted rigid tree, its functions as in a loaded run, and the report with metrics and verdict.
 
     Raises:
-        InputError: JAX without float64, or a log that does not belong to the robot.
+        InputError: JAX without float64, or a log with other joints than the robot.
+
+    Example:
+        >>> import pathlib
+        >>> import tempfile
+        >>> import jax
+        >>> import numpy as np
+        >>> import dln_jax
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> t = np.linspace(0.0, 10.0, 201)
+        >>> q = np.sin(t) + 0.3 * np.sin(3 * t)
+        >>> tau = 3.0 * (-np.sin(t) - 2.7 * np.sin(3 * t)) - 29.43 * np.cos(q)  # 3 kg at 1 m; the file says 2 kg
+        >>> link = '<joint name="hinge" axis="0 1 0"/><geom size="0.1" mass="2" pos="1 0 0"/>'
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = pathlib.Path(folder, "arm.xml")
+        ...     _ = file.write_text(f"<mujoco><worldbody><body>{link}</body></worldbody></mujoco>")
+        ...     np.savez(f"{folder}/log.npz", t=t, q=q[:, None], tau=tau[:, None])
+        ...     fit = dln_jax.identify(file, dln_jax.load_trajectories(f"{folder}/log.npz"))
+        >>> print(fit.report.verdict.level, fit.dynamics.mass_matrix([0.0]).round(1))  # kg m²
+        good [[3.]]
     """
     from dln_jax.learning.fits.automatic import identify_robot
     from dln_jax.runs.evaluation import evaluate as evaluate_fit
@@ -111,10 +145,28 @@ def identify(
 
 
 def evaluate(run: Run | str | Path, log: Log | Trajectories | str | Path) -> "Report":
-    """Evaluates a stored or fitted model on another log, all of which is the test.
+    """Evaluates a stored or fitted model on all motions of another log.
+
+    Args:
+        run: a run, from `load`, `train` or `identify`, or its folder.
+        log: from `read_log`; or trajectories, or a file.
+
+    Returns:
+        The report, with metrics (errors in SI units; `torque_mse` in (N m)² or N²) and a verdict.
 
     Raises:
         InputError: the model has no dynamics, or other joints than the log.
+
+    Example:
+        >>> import jax
+        >>> import dln_jax
+        >>> from dln_jax.scenes.datasets.generators import uniform
+        >>> from dln_jax.scenes.pendulums import pendulum
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> fit = dln_jax.train(uniform(pendulum(), samples=200), "trigonometric", degree=1, uncertainty=False)
+        >>> report = dln_jax.evaluate(fit, uniform(pendulum(mass=2.0), samples=50, seed=1))
+        >>> print(report.verdict.level, report.metrics["torque_mse"] > 1.0)  # the other pendulum is heavier
+        refused True
     """
     from dln_jax.runs.evaluation import evaluate as evaluate_fit
 
@@ -132,7 +184,7 @@ def evaluate(run: Run | str | Path, log: Log | Trajectories | str | Path) -> "Re
 
 
 def as_log(log: Log | Trajectories | str | Path, robot: Robot | None = None) -> Log:
-    """The log of a file or of trajectories; a log itself."""
+    """Converts a file or trajectories to a log; a log is returned unchanged."""
     if isinstance(log, Log):
         return log
     return log_of(log, "the data", robot=robot) if isinstance(log, Trajectories) else read_log(log, robot=robot)

@@ -61,14 +61,14 @@ class Entry(NamedTuple):
     """Makes the model from keywords, including `needs` and `dtype` if it takes them."""
     properties: Properties
     sizes: Mapping[str, tuple[str, ...]] = {}
-    """Keywords that are typical sizes, and the arrays of `Trajectories` whose standard deviation sets each."""
+    """Keywords for typical sizes -> the arrays of `Trajectories` that set them by their standard deviation."""
     additions: tuple[Callable[..., Model], ...] = ()
-    """Terms that are added to the factory's model, the last one first. Each is a function of `make`, which makes the
-    model for other needs, of `needs`, and of keywords of its own."""
+    """Functions that add terms to the factory's model; the last one is applied first. Each takes `make`, which makes
+    the model for other needs, then `needs`, then its own keywords."""
 
 
 def assembled(functions: tuple[Callable[..., Any], ...], keywords: Mapping[str, Any]) -> Any:
-    """Calls a factory, the last of the functions, and the additions around it, each with its own keywords."""
+    """Calls the factory (the last function) and wraps the additions around it, each with its own keywords."""
     first, *rest = functions
     own = {key: keywords[key] for key in inspect.signature(first).parameters if key in keywords}
     if not rest:
@@ -77,7 +77,7 @@ def assembled(functions: tuple[Callable[..., Any], ...], keywords: Mapping[str, 
 
 
 def friction_laws(*, linear: bool) -> Callable[..., Model]:
-    """The addition of the friction laws that the needs name, to a model that is `linear` in its parameters or not."""
+    """Returns the addition that gives a model the friction laws in its needs; `linear` as in `Properties`."""
 
     def add(make: Callable[[Needs], Model], needs: Needs, *, dtype: DTypeLike = jnp.float32) -> Model:
         return with_joint_friction(make(needs._replace(joint_friction=())), needs, linear=linear, dtype=dtype)
@@ -87,21 +87,22 @@ def friction_laws(*, linear: bool) -> Callable[..., Model]:
 
 @functools.wraps(make_residual)
 def residual_network(make: Callable[[Needs], Model], needs: Needs, **keywords: Any) -> Model:
-    """Adds a `make_residual`, whose keywords it takes."""
+    """Adds the residual of `make_residual` and takes its keywords."""
     return make_with_residual(make(needs), make_residual(needs, **keywords))
 
 
 def make_stored_tree(needs: Needs, *, tree: dict[str, Any], **keywords: Any) -> Model:
-    """`make_rigid_tree` for a tree from `tree_to_json`, with the friction named by the needs."""
+    """Calls `make_rigid_tree` with a tree from `tree_to_json` and the friction laws of the needs."""
     frames = tree_from_json(tree)
     if (frames.joints, frames.needs.gravity) != (needs.joints, needs.gravity):
         raise InputError(
-            f"the rigid tree has the joints {frames.joints}, and gravity if it is not zero; it got {needs}"
+            f"the rigid tree has joints {frames.joints} and gravity={frames.needs.gravity}, but the needs are {needs}; "
+            "pass needs that match"
         )
     return make_rigid_tree(frames, friction=needs.joint_friction or needs.friction, **keywords)
 
 
-# Descriptions state every keyword, so its signature names those of `make_rigid_tree`.
+# Descriptions list every keyword, so the signature includes the keywords of `make_rigid_tree`.
 _own, _rigid = (inspect.signature(function).parameters for function in (make_stored_tree, make_rigid_tree))
 _shared = [parameter for name, parameter in _rigid.items() if name not in ("tree", "friction")]
 make_stored_tree.__signature__ = inspect.Signature([_own["needs"], _own["tree"], *_shared])  # type: ignore
@@ -139,11 +140,11 @@ CATALOGUE = {
     "differential-network": Entry(make_differential_network, Properties(energy=False)),
     "latent-phase": Entry(make_image_model, Properties(energy=False)),
 }
-"""Every model that a command trains or a file names."""
+"""Every model that a command can train or a file can name."""
 
 
 def entry_of(name: str) -> Entry:
-    """The catalogue entry with this name.
+    """Returns the catalogue entry with this name.
 
     Raises:
         InputError: an unknown name.

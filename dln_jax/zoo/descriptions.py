@@ -1,8 +1,8 @@
 """Model descriptions: JSON values that rebuild a model exactly, independently of any future defaults.
 
 A description has `name`, `precision` (f32 or f64), and every keyword in the signature of the name's factory (except
-`dtype`, which follows from the precision). The name is one of the catalogue, "package.module:function" for a user's own
-importable factory, or "own" for a factory that must be passed when the model is loaded.
+`dtype`, which follows from the precision). The name is a catalogue name, "package.module:function" for your own
+importable factory, or "own" for a factory that you pass again when you load the model.
 """
 
 import contextlib
@@ -29,22 +29,32 @@ from dln_jax.zoo.catalogue import CATALOGUE, assembled, entry_of
 from dln_jax.zoo.parameter_files import REMEDY
 
 Description = dict[str, Any]
-"""JSON values."""
+"""Name, precision and keywords of a model, as JSON values."""
 OWN = "own"
-"""Name of a model whose factory is not stored in the file."""
+"""Name of a model without a stored factory."""
 
 
 def describe(model: str | Callable[..., Any], *, precision: str, **keywords: Any) -> Description:
-    """Describes a model by all keywords of its factory: those passed, and the defaults of the others.
+    """Describes a model by all keywords of its factory, with the defaults of keywords that you leave out.
 
     Args:
-        model: a name of the catalogue; a factory of your own, which must be passed again to load the model; or
+        model: a catalogue name; your own factory, which you pass again to load the model; or
             "package.module:function", which is imported and stored, so that `load(folder, trust=True)` finds it.
         precision: f32 or f64, the factory's `dtype`.
         keywords: keywords of the factory, in Python or as JSON (an activation or its name, `Needs` or a dictionary).
 
+    Returns:
+        JSON values, for `build` and `save`.
+
     Raises:
         InputError: an unknown name or keyword, a missing keyword, or a value that cannot be stored as JSON.
+
+    Example:
+        >>> import dln_jax
+        >>> needs = dln_jax.Needs(joints=("revolute", "revolute"))
+        >>> description = dln_jax.describe("structured-delan", precision="f32", needs=needs, width=16)
+        >>> print(description["name"], description["width"], description["depth"])
+        structured-delan 16 2
     """
     require_precision(precision)
     name = model if isinstance(model, str) else OWN
@@ -65,11 +75,11 @@ def describe_for(
 
 
 def typical_sizes(name: str, data: Trajectories, *, pooled: bool = False) -> dict[str, float | list[float]]:
-    """Typical sizes that a model divides by, to three digits: standard deviations of the data.
+    """Returns the typical sizes that a model divides by: standard deviations of the data, to three digits.
 
     Args:
-        pooled: one size for all coordinates, as a phase space needs, instead of one each. The data must then have all
-            the arrays; otherwise missing arrays leave the factory's default.
+        pooled: one size for all coordinates, as a phase space needs, instead of one per coordinate. The data must then
+            have all arrays; without `pooled`, a missing array leaves the factory's default.
 
     Raises:
         InputError: numbers so large or small that their squares overflow or vanish, or missing momenta.
@@ -80,7 +90,7 @@ def typical_sizes(name: str, data: Trajectories, *, pooled: bool = False) -> dic
         if len(arrays) < len(keys):
             if pooled:
                 raise InputError(
-                    "the data have no momenta p and their rates pd; add them, or set p = qd per unit of mass"
+                    "the data have no momenta p and rates pd; add them, or set p = qd and pd = qdd (unit masses)"
                 )
             continue
         numbers = np.concatenate(arrays)
@@ -91,31 +101,41 @@ def typical_sizes(name: str, data: Trajectories, *, pooled: bool = False) -> dic
 
 
 def build(description: Description, *, factory: Callable[..., Any] | None = None, trust: bool = False) -> Any:
-    """Builds the model of a description: a `Model`, or a model of functions or images.
+    """Builds a model from its description.
 
-    The same description of the catalogue gives the same object again, so that its functions are traced once.
+    Equal descriptions of catalogue models return the same object, so its functions are traced once.
 
     Args:
         description: from `describe`.
         factory: your own factory, for a model outside the catalogue.
         trust: import the factory that the description names.
 
+    Returns:
+        A `Model`, or a model of functions or images: a pair of pure functions, such as `init` and `energies`.
+
     Raises:
         InputError: an unknown name; a keyword that is missing, unknown, of the wrong type or refused by the factory; or
             a factory outside the catalogue that is neither passed nor trusted.
+
+    Example:
+        >>> import dln_jax
+        >>> needs = dln_jax.Needs(joints=("revolute",))
+        >>> model = dln_jax.build(dln_jax.describe("trigonometric", precision="f32", needs=needs, degree=1))
+        >>> print(repr(model).splitlines()[0])
+        Model of 5 parameters
     """
     name = description.get("name")
     if not isinstance(name, str):
-        raise InputError(f"model description: name is {reprlib.repr(name)}, expected that of a model; {REMEDY}")
+        raise InputError(f"model description: name is {reprlib.repr(name)}; expected a model name; {REMEDY}")
     if factory is None and name in CATALOGUE:
-        with contextlib.suppress(TypeError):  # values that JSON does not have, which are refused below
+        with contextlib.suppress(TypeError):  # values that JSON cannot hold; _built refuses them
             return catalogued(json.dumps(description))
     return _built(description, functions_of(name, factory, trust=trust))
 
 
 @functools.lru_cache(maxsize=16)
 def catalogued(text: str) -> Any:
-    """Builds the model of a description in JSON, and keeps it."""
+    """Builds the model of a JSON description, and caches it."""
     description = json.loads(text)
     return _built(description, functions_of(description["name"]))
 
@@ -140,23 +160,40 @@ def _built(description: Description, functions: tuple[Callable[..., Any], ...]) 
 
 
 def model_names() -> dict[str, str]:
-    """The models of the catalogue by name, each with the first line on its factory."""
+    """Returns the name of every model in the catalogue, with the first line of its factory's docstring.
+
+    Example:
+        >>> import dln_jax
+        >>> names = dln_jax.model_names()
+        >>> print([name for name in names if name.endswith("delan")])
+        ['structured-delan', 'black-box-delan']
+    """
     return {name: (entry.factory.__doc__ or "").partition("\n")[0] for name, entry in CATALOGUE.items()}
 
 
 def make(name: str, needs: Needs, *, precision: str = "f64", **keywords: Any) -> Any:
-    """Makes a model of the catalogue for a plant; `print` shows its parameters.
-
-        model = make("structured-delan", Needs(joints=("revolute",)), width=16)
+    """Makes a catalogue model for a plant; `print` shows its parameters.
 
     Args:
         name: one of `model_names()`.
         needs: joints and terms of the plant.
-        precision: f32 or f64.
-        keywords: keywords of the factory.
+        precision: f32 or f64; f64 needs JAX's double precision.
+        keywords: keywords of the factory, such as `width`.
+
+    Returns:
+        A `Model`, or a model of functions or images.
 
     Raises:
         InputError: as for `describe` and `build`.
+
+    Example:
+        >>> import jax
+        >>> import dln_jax
+        >>> needs = dln_jax.Needs(joints=("prismatic", "revolute"))
+        >>> model = dln_jax.make("structured-delan", needs, precision="f32", width=8)
+        >>> arm = dln_jax.dynamics(model.energies(model.init(jax.random.key(0))))
+        >>> print(arm.mass_matrix([0.1, 0.5]).shape)
+        (2, 2)
     """
     return build(describe(name, precision=precision, needs=needs, **keywords))
 
@@ -164,7 +201,7 @@ def make(name: str, needs: Needs, *, precision: str = "f64", **keywords: Any) ->
 def functions_of(
     name: str, factory: Callable[..., Any] | None = None, *, trust: bool = False
 ) -> tuple[Callable[..., Any], ...]:
-    """Functions that make a named model: additions and factory of the catalogue, or a user's; errors as for `build`."""
+    """Returns the functions that make a named model: additions, then the factory. Errors as for `build`."""
     module, colon, function = name.partition(":")
     if not colon and name != OWN:
         entry = entry_of(name)
@@ -174,11 +211,11 @@ def functions_of(
     if factory is not None:
         return (factory,)
     if not colon:
-        raise InputError("the model has a factory of its own, which the file does not tell; give it as factory=")
+        raise InputError("the file does not store the factory of this model; pass it as factory=")
     if not trust:
         raise InputError(
-            f"the model is made by {name[:200]}, which is not code of this package; "
-            "give that function as factory=, or trust=True to have it imported"
+            f"the factory {name[:200]} is not part of dln_jax; "
+            "pass that function as factory=, or trust=True to import it"
         )
     try:
         imported = getattr(importlib.import_module(module), function)
@@ -204,7 +241,7 @@ def _require_keys(values: Mapping[str, Any], expected: Collection[str]) -> None:
     if missing := set(expected) - set(values):
         raise InputError(f"model description: lacks {', '.join(sorted(missing))}; {REMEDY}")
     if unknown := set(values) - set(expected):
-        raise InputError(f"model description: unknown are {reprlib.repr(', '.join(sorted(unknown)))}; {REMEDY}")
+        raise InputError(f"model description: unknown keys {reprlib.repr(', '.join(sorted(unknown)))}; {REMEDY}")
     needs = values.get("needs")
     if isinstance(needs, dict) and (missing := set(Needs._fields) - set(needs)):
         raise InputError(f"model description: needs lack {', '.join(sorted(missing))}; {REMEDY}")
@@ -224,7 +261,7 @@ def _as_json(key: str, value: Any) -> Any:
             raise InputError(f"{key} is {value}; expected a finite number")
         case None | bool() | int() | float() | str():
             return value
-    raise InputError(f"{key} is a {type(value).__name__}, which no file can hold; expected numbers, names or switches")
+    raise InputError(f"{key} is a {type(value).__name__}, which JSON cannot store; expected numbers, names or booleans")
 
 
 def _keywords(values: Mapping[str, Any], functions: tuple[Callable[..., Any], ...]) -> dict[str, Any]:

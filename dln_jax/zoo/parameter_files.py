@@ -1,9 +1,7 @@
-"""Parameter trees on disk, and the uncertainty of a model: tensors as safetensors, metadata as JSON.
+"""Stores parameter trees and uncertainties: tensors as safetensors, metadata as JSON. Reading them never runs code.
 
-Reading them never runs code.
-
-The manifest names its tensor file and stores its SHA-256, so a truncated, swapped or edited file is refused. Both files
-are written beside the old ones and then renamed, the manifest last: a reader sees the old pair or the new.
+The manifest stores the name and the SHA-256 of its tensor file, so a truncated, swapped or edited file is refused. Both
+files are written beside the old ones and then renamed, the manifest last: a reader sees the old pair or the new one.
 """
 
 import hashlib
@@ -24,11 +22,11 @@ from dln_jax.precision import data_type
 from dln_jax.types import InputError
 
 MODEL = "model"
-"""Stem of the pair of files in a run folder that holds the trained model."""
+"""Stem of the two files that hold the trained model in a run folder."""
 VALUE = "value"
-"""Stem of the pair of files in a run folder that holds a value function."""
+"""Stem of the two files that hold a value function."""
 UNCERTAINTY = "uncertainty"
-"""Stem of the pair of files with the uncertainty of the model in the same folder."""
+"""Stem of the two files that hold the uncertainty of the model in the same folder."""
 SCHEMA_VERSION = 2
 REMEDY = "restore the file or train again"
 
@@ -40,7 +38,7 @@ class Shape(TypedDict):
 
 
 class Manifest(msgspec.Struct):
-    """Entries that every manifest has."""
+    """Entries of every manifest."""
 
     schema_version: int
     tensor_file: str
@@ -61,7 +59,7 @@ def save_tree(directory: Path, name: str, tree: Any, facts: dict[str, Any], *, n
         facts: JSON values to store in the manifest with versions, shapes and digest.
         number: distinguishes successive states of one run.
     """
-    # safetensors writes the raw memory, which must be in row-major order for the numbers to be read back correctly.
+    # safetensors writes raw memory and reads it in row-major order.
     tensors = {key: np.asarray(leaf, order="C") for key, leaf in _flatten(tree).items()}
     data = safetensors.numpy.save(tensors)
     file_name = f"{name}.safetensors" if number is None else f"{name}-{number:09d}.safetensors"
@@ -82,11 +80,11 @@ def save_tree(directory: Path, name: str, tree: Any, facts: dict[str, Any], *, n
 
 
 def require_fitting(tree: Any, like: Any, *, kinds: str = "fiu") -> None:
-    """Raises `InputError` unless a tree has arrays of these kinds, with the names, shapes and dtypes of another."""
+    """Raises `InputError` unless a tree has arrays of these kinds with the names, shapes and dtypes of `like`."""
     own, expected = _flatten(tree), _flatten(like)
     if different := sorted(set(own) ^ set(expected)):
         state = "unknown" if different[0] in own else "missing"
-        raise InputError(f"the parameters are those of another model: '{different[0]:.80}' is {state}")
+        raise InputError(f"the parameters belong to another model: '{different[0]:.80}' is {state}")
     for key, array in expected.items():
         if not isinstance(own[key], np.ndarray | jax.Array | np.generic) or own[key].dtype.kind not in kinds:
             raise InputError(f"parameter '{key}' is {reprlib.repr(own[key])}; expected an array of real numbers")
@@ -96,10 +94,10 @@ def require_fitting(tree: Any, like: Any, *, kinds: str = "fiu") -> None:
 
 
 def load_manifest(directory: Path, name: str) -> dict[str, Any]:
-    """Reads the manifest `name.json`; `InputError` if it is missing, no JSON object, or of another schema version."""
+    """Reads the manifest `name.json`; `InputError` if it is missing, malformed, or has another schema version."""
     path = directory / f"{name}.json"
     if not is_file(path):
-        raise InputError(f"{path}: no such file; give the folder of a run that has written one")
+        raise InputError(f"{path}: no such file; give the folder of a finished run")
     manifest = read_json(path, remedy=REMEDY)
     if manifest.get("schema_version") != SCHEMA_VERSION:
         version = reprlib.repr(manifest.get("schema_version"))
@@ -134,7 +132,7 @@ def load_tree(directory: Path, name: str, like: Any) -> Any:
         require_fitting(tensors, like, kinds="fiub")
     except InputError as error:
         raise InputError(f"{path}: {error}; load it with the settings and precision it was written with") from None
-    # Copies, because arrays that share the file's bytes could not be donated.
+    # Copied, because JAX cannot donate arrays that share the bytes of the file.
     leaves = [jax.numpy.array(tensors[key]) for key in _flatten(like)]
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
@@ -144,7 +142,7 @@ def save_uncertainty(directory: str | Path, uncertainty: Uncertainty, **facts: A
 
     Args:
         uncertainty: uncertainty of the model's parameters, from `learning.uncertainty.estimate`.
-        facts: JSON values on how it was estimated.
+        facts: JSON values that record how it was estimated.
 
     Raises:
         InputError: the folder has no model, or the number of parameters differs.
@@ -154,7 +152,7 @@ def save_uncertainty(directory: str | Path, uncertainty: Uncertainty, **facts: A
     P, own = sum(int(np.prod(tensor["shape"])) for tensor in manifest["tensors"].values()), len(uncertainty.factor)
     if own != P:
         raise InputError(
-            f"the uncertainty is of {own} parameters, and the model in {directory} has {P}; estimate it of that model"
+            f"the uncertainty has {own} parameters, but the model in {directory} has {P}; estimate it for that model"
         )
     dtype = data_type(str(manifest["model"]["precision"]))
     stored = jax.tree.map(lambda leaf: np.asarray(leaf, dtype), uncertainty)
@@ -165,14 +163,14 @@ def load_uncertainty(directory: Path) -> Uncertainty | None:
     """Loads the uncertainty stored beside a run's model; `None` if there is none.
 
     Raises:
-        InputError: it is damaged, or belongs to other parameters than the model's.
+        InputError: it is damaged, or belongs to other parameters.
     """
     path = directory / f"{UNCERTAINTY}.json"
     if not is_file(path):
         return None
     manifest, of = load_manifest(directory, UNCERTAINTY), load_manifest(directory, MODEL)
     if manifest.get("of") != of.get("sha256"):
-        raise InputError(f"{path}: belongs to other parameters than the model's; delete it, {REMEDY}")
+        raise InputError(f"{path}: belongs to other parameters than the model beside it; delete it, {REMEDY}")
     try:
         stated = {key: tuple(tensor["shape"]) for key, tensor in manifest["tensors"].items()}
         (P, K), (d,), u = stated["factor"], stated["noise"], stated["domain/undetermined"][1]

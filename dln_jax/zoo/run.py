@@ -46,13 +46,13 @@ AnyModel = Model | FunctionModel | ImageModel
 class Run:
     """A trained model with jitted functions of one state.
 
-    The functions take arrays or lists of numbers and compute in the precision of the training. To continue training, to
-    differentiate in parameters or to extend the model, use `model` and `parameters`:
+    The functions take arrays or lists of numbers and compute in the precision of the training. To continue training,
+    differentiate with respect to parameters, or extend the model, use `model` and `parameters`:
     `mechanics.equations.dynamics(run.model.energies(parameters))`.
     """
 
     model: AnyModel
-    """Pair of pure functions: of a mechanical system, of a function, or of images."""
+    """Pair of pure functions that model a mechanical system, a function, or images."""
     parameters: Parameters
     """Parameters of the model."""
     description: Description
@@ -63,7 +63,7 @@ class Run:
     """Value function in the folder, if it has one."""
 
     def __repr__(self) -> str:
-        """The model's name, its number of parameters, and whether it has an uncertainty."""
+        """Shows the name, the number of parameters, and whether the run has an uncertainty."""
         size = sum(np.size(leaf) for leaf in jax.tree.leaves(self.parameters))
         more = "without uncertainty" if self.uncertainty is None else "with uncertainty"
         name, precision = self.description["name"], self.description["precision"]
@@ -71,47 +71,47 @@ class Run:
 
     @functools.cached_property
     def energies(self) -> Any:
-        """One of `mechanics.equations.System`, not jitted. Raises InputError for a model without mechanics."""
+        """The energies (`mechanics.equations.System`), not jitted; `InputError` for a model without mechanics."""
         return self._of("energies", Model).energies(self.parameters)
 
     @functools.cached_property
     def dynamics(self) -> Dynamics | InverseForward:
-        """Functions of coordinates and velocities. Raises InputError for a model that has none."""
+        """Functions of coordinates and velocities; `InputError` for a model without them."""
         return self._compiled("dynamics", equations.dynamics, PhaseRates)
 
     @functools.cached_property
     def flow(self) -> Flow | PhaseRates:
-        """Functions of coordinates and momenta, without applied forces. Raises InputError for a model that has none."""
+        """Functions of coordinates and momenta, without applied forces; `InputError` for a model without them."""
         return self._compiled("flow", equations.flow, InverseForward)
 
     @functools.cached_property
     def derivatives(self) -> Callable[[VectorLike], Derivatives]:
-        """x [n] -> value, Jacobian and Hessian. Raises InputError unless the model is a differential network."""
+        """x [n] -> value, Jacobian and Hessian; `InputError` unless the model is a differential network."""
         return _jitted(self._of("derivatives", FunctionModel).derivatives(self.parameters), self.dtype)
 
     @functools.cached_property
     def images(self) -> LatentPhase:
-        """Encoder, decoder and flow of the latent plane. Raises InputError for a model that is not of images."""
+        """Encoder, decoder and flow of the latent plane; `InputError` unless the model is for images."""
         system = self._of("images", ImageModel).images(self.parameters)
         encode, decode = (_jitted(function, self.dtype) for function in (system.encode, system.decode))
         return LatentPhase(encode, decode, compiled(system.field, self.dtype))
 
     @property
     def value(self) -> "ValueRun":
-        """Value function with its plant and law. Raises InputError for a run without one."""
+        """Value function with its plant and control law; `InputError` for a run without one."""
         if self.value_function is None:
             raise self._refusal("value")
         return self.value_function
 
     @functools.cached_property
     def torque_std(self) -> Callable[[VectorLike, VectorLike, VectorLike], Array]:
-        """(q, qd, qdd) -> deviation [d] of a measured torque, N m or N; `InputError` for a run without uncertainty."""
+        """(q, qd, qdd) -> standard deviation [d] of a measured torque, N m or N; `InputError` without uncertainty."""
         factor, noise, inflation, _ = self._known_uncertainty
         return _jitted(predictive(self._of("torque_std", Model), self.parameters, factor, noise, inflation), self.dtype)
 
     @functools.cached_property
     def out_of_distribution(self) -> Callable[[VectorLike, VectorLike, VectorLike], Array]:
-        """(q, qd, qdd) -> whether the state is out of distribution. Raises InputError for a run without uncertainty."""
+        """(q, qd, qdd) -> whether the state is out of distribution; `InputError` for a run without an uncertainty."""
         uncertainty = self._known_uncertainty
         model = self._of("out_of_distribution", Model)
         return _jitted(uncertainties.out_of_distribution(model, self.parameters, uncertainty), self.dtype)
@@ -120,8 +120,8 @@ class Run:
     def _known_uncertainty(self) -> Uncertainty:
         if self.uncertainty is None:
             raise InputError(
-                "the run has no uncertainty: train it again by train_delan, or store an estimate of "
-                "learning.uncertainty by save_uncertainty"
+                "the run has no uncertainty; train it again with train_delan, or estimate one with "
+                "learning.uncertainty and store it with save_uncertainty"
             )
         return self.uncertainty
 
@@ -131,7 +131,7 @@ class Run:
         return data_type(self.description["precision"])
 
     def _compiled(self, asked: str, functions_of: Callable[..., Any], other: type) -> Any:
-        """Functions of the energies, unless these are of the other kind."""
+        """Jitted functions of the energies; `InputError` if the energies are of the other kind."""
         if isinstance(self.energies, other):
             raise self._refusal(asked)
         needs = self.description.get("needs")
@@ -153,7 +153,7 @@ class Run:
         else:
             plain = {PhaseRates: ".flow", InverseForward: ".dynamics"}
             offered = plain.get(type(self.energies), ".dynamics or .flow")
-        return InputError(f"a {self.description['name']} has no {asked}; ask for {offered}")
+        return InputError(f"a {self.description['name']} has no {asked}; use {offered}")
 
 
 def save_model(
@@ -162,25 +162,39 @@ def save_model(
     """Writes `model.safetensors` and `model.json` into an existing folder, for `load`; public as `dln_jax.save`.
 
     Args:
+        directory: the folder.
         description: from `describe`.
-        overwrite: replace the model in the folder and discard the uncertainty of its parameters.
+        parameters: parameters of that model.
+        overwrite: replace the model in the folder and discard its uncertainty.
 
     Raises:
-        InputError: the folder does not exist or already has a model, or the parameters are of another model.
+        InputError: the folder does not exist or already has a model, or the parameters belong to another model.
+
+    Example:
+        >>> import tempfile
+        >>> import jax
+        >>> import dln_jax
+        >>> needs = dln_jax.Needs(joints=("revolute",))
+        >>> description = dln_jax.describe("structured-delan", precision="f32", needs=needs, width=8)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     dln_jax.save(folder, description, dln_jax.build(description).init(jax.random.key(0)))
+        ...     run = dln_jax.load(folder)
+        >>> print(run.description["width"], run.dynamics.inverse_dynamics([0.3], [0.5], [2.0]).shape)
+        8 (1,)
     """
     directory = Path(directory)
     if not directory.is_dir():
         raise InputError(f"{directory}: no such folder; create it first")
     if is_file(directory / f"{MODEL}.json") and not overwrite:
-        raise InputError(f"{directory} has a model already; choose another folder, or give overwrite=True")
+        raise InputError(f"{directory} already contains a model; choose another folder, or pass overwrite=True")
     save(directory, description, parameters)
 
 
 def save(directory: str | Path, description: Description, parameters: Parameters) -> None:
-    """Like `save_model`, but replaces the model of a run in training; `InputError` for parameters of another model."""
+    """Like `save_model`, but replaces the model of a running training; `InputError` for parameters of another model."""
     name = description.get("name")
     if name == OWN or ":" in str(name):
-        like = jax.tree.map(np.asarray, parameters)  # the factory is the user's, so only the structure is known
+        like = jax.tree.map(np.asarray, parameters)  # a user's factory: only the structure is known
     else:
         like = jax.eval_shape(build(description).init, jax.random.key(0))
     require_fitting(parameters, like)
@@ -189,16 +203,31 @@ def save(directory: str | Path, description: Description, parameters: Parameters
 
 
 def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, trust: bool = False) -> Run:
-    """Loads the trained run in a folder.
+    """Loads a trained model from its run folder.
 
     Args:
-        directory: folder written by a training command or by `save`.
+        directory: folder written by a training command, by `Fit.save` or by `save`.
         factory: factory of a model outside the catalogue.
-        trust: import the factory that the file names. Use it only for files that you have written: importing runs code.
+        trust: import the factory that the file names. Use it only for your own files: importing runs code.
+
+    Returns:
+        The model with jitted functions of one state (`dynamics`, `flow`, ...), its parameters and its uncertainty.
 
     Raises:
-        InputError: the folder has no model, or a damaged or altered one or one of another schema; a factory outside the
-            catalogue is neither passed nor trusted; or the model needs double precision (the message names the line).
+        InputError: the folder has no model, or the model is damaged, altered or from another schema; a factory outside
+            the catalogue is neither passed nor trusted; or the model needs double precision (the message has the line
+            to add).
+
+    Example:
+        >>> import tempfile
+        >>> import jax
+        >>> import dln_jax
+        >>> needs = dln_jax.Needs(joints=("revolute",))
+        >>> description = dln_jax.describe("trigonometric", precision="f32", needs=needs, degree=1)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     dln_jax.save(folder, description, dln_jax.build(description).init(jax.random.key(0)))
+        ...     print(repr(dln_jax.load(folder)).splitlines()[0])
+        Run of trigonometric: 5 parameters, f32
     """
     directory = Path(directory)
     description = read_description(directory)
@@ -215,7 +244,7 @@ def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, tr
 
 
 def _value_in(directory: Path, model: Any, parameters: Parameters) -> "ValueRun | None":
-    """The value function in a folder of a model, if there is one."""
+    """Returns the value function in a model's folder, if there is one."""
     if not is_file(directory / f"{VALUE}.json"):
         return None
     from dln_jax.zoo.value_functions import load_value  # other runs do not need optimal control
@@ -224,7 +253,7 @@ def _value_in(directory: Path, model: Any, parameters: Parameters) -> "ValueRun 
 
 
 def read_description(directory: Path) -> Description:
-    """The description in a run's folder; raises `InputError` if there is none."""
+    """Reads the model description in a run folder; `InputError` if there is none."""
     description = load_manifest(directory, MODEL).get("model")
     if not isinstance(description, dict):
         raise InputError(f"{directory / MODEL}.json: describes no model; {REMEDY}")
@@ -232,13 +261,13 @@ def read_description(directory: Path) -> Description:
 
 
 def compiled(functions: Functions, dtype: Any) -> Functions:
-    """Jits the functions and converts numbers in their arguments to one dtype."""
+    """Jits the functions, and converts numbers in their arguments to this dtype."""
     return jax.tree.map(lambda function: _jitted(function, dtype), functions)
 
 
 def _jitted(function: Callable[..., Any], dtype: Any) -> Any:
     def convert(leaf):
-        # Other types stay unchanged, for the function to refuse.
+        # The function itself refuses other types.
         kinds = (jnp.floating, jnp.integer)
         return leaf.astype(dtype) if any(jnp.issubdtype(leaf.dtype, kind) for kind in kinds) else leaf
 

@@ -1,4 +1,4 @@
-"""Value functions in run folders, with the plant that each belongs to."""
+"""Value functions in run folders, with their plants."""
 
 import dataclasses
 import functools
@@ -24,7 +24,7 @@ from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import REMEDY, VALUE, load_manifest, load_tree, save_tree
 
 SETTINGS = {"widths": tuple[int, ...], "members": int, "activation": str, "floor": float, "scale": float}
-"""Arguments of `value_network` that value.json states."""
+"""Arguments of `value_network` stored in value.json, and their types."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +32,11 @@ class ValueRun:
     """A value function with its plant."""
 
     name: str
-    """Name of the plant, or the file or folder that it is from."""
+    """Name of the plant, or its file or folder."""
     problem: ControlProblem
     """The control problem: dynamics and cost."""
     own: OwnProblem
-    """The numbers of the problem."""
+    """The problem as numbers, without functions."""
     network: ValueNetwork
     parameters: Any
 
@@ -52,14 +52,14 @@ class ValueRun:
 
 
 def plant_of_model(model: Any, parameters: Parameters, problem: OwnProblem) -> ControlProblem:
-    """The control problem of a learned or identified `Model` of joints."""
-    # Value iteration in float32 reads NumPy's float64 as float32, but not JAX's.
+    """Returns the control problem of a learned or identified `Model` of joints."""
+    # Value iteration in float32 converts NumPy's float64 arrays to float32, but not JAX's.
     energies = model.energies(jax.tree.map(np.asarray, parameters))
     return own_plant(equations.dynamics(energies, degrees_of_freedom=len(problem.joints)), problem)
 
 
 def network_of(problem: ControlProblem, settings: Mapping[str, Any]) -> ValueNetwork:
-    """The value network with these `SETTINGS`."""
+    """Returns the value network with these `SETTINGS`."""
     return value_network(problem, **{**settings, "activation": activation(settings["activation"])})
 
 
@@ -75,10 +75,10 @@ def save_value(folder: Path, plant: str, settings: Mapping[str, Any], parameters
 
 
 def load_value(folder: Path, model: Any, parameters: Parameters) -> ValueRun:
-    """The value function in a folder, of the model of a plant that is stored with it.
+    """Loads the value function in a folder; the plant is the model stored beside it.
 
     Raises:
-        InputError: there is none, or its files are damaged or of another release.
+        InputError: there is none, or its files are damaged or come from another release.
     """
     path, manifest = folder / f"{VALUE}.json", load_manifest(folder, VALUE)
 

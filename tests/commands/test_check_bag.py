@@ -42,8 +42,8 @@ def test_a_bag_is_examined_beside_the_robot(place, capsys):
     assert "times panda_shoulder 0.5" in said
     rows = {
         "--topics /joint_states": "no efforts in the messages",
-        "--joints panda_elbow,panda_finger": "the robot's joint 'fer_shoulder' is not among the data's",
-        "--torque-factor fer_elbow=2": "'fer_elbow' is not among the log's joints (panda_shoulder, panda_elbow)",
+        "--joints panda_elbow,panda_finger": "the robot's joint 'fer_shoulder' is not in the data",
+        "--torque-factor fer_elbow=2": "'fer_elbow' is not a joint of the log (panda_shoulder, panda_elbow)",
         "--torque-factor panda_elbow=1,panda_elbow=2": "--torque-factor names 'panda_elbow' twice",
         "--torque-factor much": "--torque-factor is 'much'; expected finite numbers",
     }

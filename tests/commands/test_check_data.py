@@ -30,7 +30,7 @@ def log(tmp_path, monkeypatch):
 def test_a_log_is_examined(log, capsys):
     command(check_data, "--data log.npz --out check")
     said = capsys.readouterr().out
-    assert "1600 samples of 4 trajectories, 1 joints" in said and "warning: accelerations by differences" in said
+    assert "1600 samples of 4 trajectories, 1 joints" in said and "warning: accelerations differenced from q" in said
     assert Path("check/report.txt").read_text().strip() in said and Path("check/log.png").stat().st_size > 10_000
     findings = json_of(Path("check/findings.json"))["findings"]
     assert [each["check"] for each in findings] == ["raw-differences"]
@@ -51,7 +51,7 @@ def test_missing_rates_of_a_noisy_log_come_from_filtered_q_unless_the_user_decli
             command(train_delan, fit, *option, "--out", name)
         said = capsys.readouterr().out
         assert ("q filtered without delay at" in said) == ("verdict: good" in said) == (name == "default")
-        cause = "; in the log, accelerations by differences of this q have noise of"
+        cause = "; in the log, accelerations differenced from q are"
         assert (cause in said) == (name == "raw")
         errors[name] = json_of(Path(name, "metrics.json"))["torque_mse"]
     assert errors["default"] < 0.1 * errors["raw"]
@@ -82,7 +82,11 @@ def test_a_log_is_filtered_by_default_only_where_noise_matters_and_rates_are_mis
 def test_errors_in_a_log_stop_a_training_unless_they_are_accepted(log, capsys):
     given = "--data degrees.npz --model trigonometric --degree 1 --out run"
     said = refused(capsys, train_delan, given)
-    assert "convert to radians" in said and "--accept-log" in said and "check_data --data degrees.npz says more" in said
+    assert (
+        "convert to radians" in said
+        and "--accept-log" in said
+        and "details: dln-jax check_data --data degrees.npz" in said
+    )
     assert not Path("run").exists()
     command(train_delan, given, "--accept-log --no-figures --no-uncertainty")
     said = capsys.readouterr().out

@@ -68,7 +68,7 @@ def test_bad_input_is_one_line(arm, tmp_path, capsys):
         ("--payload-position 0,1 --payload 1", "expected 3 numbers"),
         ("--velocity-scale 0", "velocity_scale is 0"),
         ("--allow-unlimited shoulder", "joint 'elbow' has no limit of position: state it (--position"),
-        ("--allow-unlimited", "shoulder, wrist", "there is no joint 'wrist' to allow without limits"),
+        ("--allow-unlimited", "shoulder, wrist", "no joint matches 'wrist' of --allow-unlimited"),
     ]
     assert_refused(capsys, excite, rows, "--allow-unlimited * --robot", arm, out=tmp_path / "run")
 

@@ -87,9 +87,9 @@ def test_mistakes_are_one_line(workplace, capsys):
     np.savez("silent.npz", t=log["t"], q=log["q"])
     (workplace / "broken.urdf").write_text("<robot>")
     rows = {
-        "--data other.npz": "joint 'shoulder' is not among the data's (elbow, wrist)",
+        "--data other.npz": "joint 'shoulder' is not in the data (elbow, wrist)",
         "--data one.npz": "the data have 1 joints, the robot 2",
-        "--data silent.npz": "there is no tau",
+        "--data silent.npz": "column tau is missing",
         "--robot broken.urdf": "not XML",
         "--velocity-scale 0": "velocity_scale is 0.0",
         "--window 0.3": "--window is for --by motions or both",

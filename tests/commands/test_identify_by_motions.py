@@ -65,7 +65,7 @@ def test_the_slope_of_windows_is_that_of_finite_differences(place):
         np.testing.assert_allclose(slopes[:, :, column], difference, atol=1e-4 * max(1.0, np.abs(difference).max()))
     stiff = np.concatenate([theta[:-1], [100.0]])
     # It decays at 100 / 0.06 1/s, and a Runge-Kutta step of 10 ms is stable up to 278.5 1/s.
-    with one_line(r"friction acts up to 5\.98 times faster than the log's step of 0\.01 s resolves"):
+    with one_line(r"friction is up to 5\.98 times too fast for the log's time step of 0\.01 s"):
         fit_motions(model, columns_of(known), stiff, stiff, *windows, noise_tau=scales[1])
 
 

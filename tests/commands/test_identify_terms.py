@@ -79,6 +79,6 @@ def test_terms_that_are_none_are_refused(folder, capsys):
         ("--coupled 1-2", "--coupled has '1-2'; expected pairs of joints such as 2:3"),
         ("--coupled 1:3", "--coupled is 1:3; expected distinct pairs i:j of joints"),
         ("--friction coulomb,temperature", "temperature changes viscous friction"),
-        ("--friction viscous,temperature", "friction is to depend on temperature, which the data do not have"),
+        ("--friction viscous,temperature", "friction by temperature needs temperatures, but the data have none"),
     ]
     assert_refused(capsys, identify, rows, "--robot arm.xml --data cold.npz --accept-log", out=folder / "none")

@@ -142,7 +142,7 @@ def test_only_what_is_needed_is_read_and_no_more_than_the_bound(here, monkeypatc
     with one_line(r"'x' is missing.*not read: t, .*notes"):
         functions.load("data.npz")
     monkeypatch.setattr(arrays, "MOST_BYTES", 1000)
-    with one_line("holds more than"):
+    with one_line("larger than"):
         schema.load("data.npz")
 
 
@@ -153,7 +153,7 @@ def test_a_copy_of_a_trajectory_in_the_test_is_refused(here, capsys):
     copied = {key: TRAJECTORIES[key][[*range(16), *range(4, 8)]] for key in STATES}
     np.savez("copied.npz", **{**TRAJECTORIES, **copied})
     for script in (train_delan, train_hnn):
-        assert "'4' is a copy of '1'" in refuse(capsys, script, "--data copied.npz --out run")
+        assert "'4' is a copy of training trajectory '1'" in refuse(capsys, script, "--data copied.npz --out run")
     at_rest = schema.from_arrays({**TRAJECTORIES, **dict.fromkeys(STATES, np.ones((20, 2)))})
     assert len(split(at_rest).test.t) == 4, "a body at rest is at rest in every recording"
 

@@ -54,7 +54,7 @@ def test_stated_noise_is_used_or_refused(files, capsys):
     assert "noise has 3 numbers; expected one, or one for each of 1 coordinates, or 2 of q and then p" in line
     # A file without torques names the command for it.
     line = refused(capsys, train_hnn, "--data spring.npz --out none")
-    assert "spring.npz: there is no tau" in line and "train_hnn_task --task measured --data spring.npz" in line
+    assert "spring.npz: column tau is missing" in line and "train_hnn_task --task measured --data spring.npz" in line
 
 
 def test_a_file_without_rates_of_momenta_is_no_mass_of_one(files):

@@ -55,7 +55,7 @@ def test_mistakes_are_one_line_and_leave_nothing(capsys, tmp_path):
     assert_refused(capsys, swing_up, rows, "--plant", file, out=tmp_path / "run")
     # A time step that would fill the memory.
     file.write_text(file.read_text().replace("<mujoco>", '<mujoco><option timestep="1e-9"/>'))
-    rows = [(MOTOR, "30 s of motion at 1e+09 Hz would take about")]
+    rows = [(MOTOR, "30 s of motion at 1e+09 Hz would need about")]
     assert_refused(capsys, swing_up, rows, "--plant", file, out=tmp_path / "run")
 
 

@@ -94,7 +94,7 @@ def test_a_target_grows_the_network_and_lists_every_candidate(workplace, capsys,
     monkeypatch.setattr(network, "WIDTHS", (2,))
     monkeypatch.setattr(network, "DEPTHS", (1,))
     command(train_delan, "--data swing.npz --steps 2", BRIEF, "--target 1e-30 --out hard")
-    assert "no candidate meets 1e-30; kept is the most accurate" in capsys.readouterr().out
+    assert "no candidate meets 1e-30; the most accurate one is kept" in capsys.readouterr().out
     candidates = json_of(workplace / "hard/selection.json")["candidates"]
     assert [each["name"] for each in candidates] == ["1 x 2, one network", "1 x 2, two networks"]
     best = min(candidates, key=lambda each: each["validation_error"])

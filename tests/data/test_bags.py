@@ -82,7 +82,7 @@ def test_topics_of_different_rates_are_put_on_the_slower_clock(bag):
     assert_allclose([data.q, data.qd], [q, qd], atol=1e-7)
     assert_allclose(data.tau, tau * [0.5, 1], atol=1e-12)
     assert "effort of elbow in /currents, 100 Hz; q and qd by cubic splines" in data.remarks[0]
-    assert data.remarks[1] == "tau is that of the log times elbow 0.5, shoulder 1"
+    assert data.remarks[1] == "tau of the log is multiplied by elbow 0.5, shoulder 1"
 
 
 def test_gaps_of_one_topic_are_left_out(bag):
@@ -151,7 +151,7 @@ def test_bags_that_cannot_be_used_are_refused_in_one_line(bag, tmp_path, monkeyp
         (two, {}, "/joint_states, /other have joint states; choose, or combine, by --topics A,B"),
         (two, {"topics": ["/jointstates"]}, r"topic /jointstates is not in the bag; the bag has /joint_states"),
         (two, {"topics": ["/rosout"]}, "/rosout has messages std_msgs/msg/String; expected sensor_msgs/msg/JointState"),
-        (two, {**other, "joints": ["wrist"]}, r"'wrist' is not among the log's joints \(elbow, shoulder"),
+        (two, {**other, "joints": ["wrist"]}, r"'wrist' is not a joint of the log \(elbow, shoulder"),
         (bag({}, others=["/rosout"]), {}, r"no topic has .*JointState; the bag has /rosout \(std_msgs/msg/String\)"),
         (bag(apart), {"topics": ["/a", "/b"]}, "the messages of /a, /b do not overlap in time"),
         (bag([state(0, NAMES, [1.0, 2.0], [1.0])]), {}, "message 1 of .* has 2 names, but velocity of length 1"),
@@ -168,5 +168,5 @@ def test_bags_that_cannot_be_used_are_refused_in_one_line(bag, tmp_path, monkeyp
             schema.load(path, **stated)
         assert str(path) in str(refusal.value)
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    with one_line(r"takes the package rosbags: pip install 'dln-jax\[bag\]'"):
+    with one_line(r"needs the package rosbags: pip install 'dln-jax\[bag\]'"):
         schema.load(two)

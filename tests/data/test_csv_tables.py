@@ -72,7 +72,7 @@ def test_units_that_no_title_states_are_asked_for(load):
 
 def test_radians_are_not_read_as_degrees(load):
     rows = "0,1.5,-3\n1,6.2,1\n2,0.5,0\n"
-    with one_line(r"q goes to 6\.2 at most, as angles in radians do; give --units si, or"):
+    with one_line(r"q reaches only 6\.2, which looks like radians; give --units si, or"):
         load("t,q1,q2\n" + rows, units="degrees")
     # A unit in the title is the way out, and one joint that is beyond a turn decides for all.
     assert_allclose(load("t,q1 [deg],q2 [deg]\n" + rows, units="degrees").q[0, 0], np.deg2rad(1.5))
@@ -114,9 +114,9 @@ MALFORMED = (
     ("t [s],,q1 [rad]\n0,1,2\n", "column 2 has no title"),
     ("t [s],q1 [rad],q2 [rad],tau1 [N m]\n0,1,2,3\n", "no column 'tau2'"),
     ("t [s],q1 [rad],tau1 [N m],tau2 [N m]\n0,1,2,3\n", "no column 'q2'"),
-    ("t [s],q1 [rad],tau1 [MN m]\n0,1,2\n", r"the unit of 'tau1 \[MN m\]' is not known"),  # not milli
+    ("t [s],q1 [rad],tau1 [MN m]\n0,1,2\n", r"'tau1 \[MN m\]' has an unknown unit"),  # not milli
     ("t_s,q1_rad,tau1_MNm\n0,1,2\n", "there is no column 'q1_MNm'|tau1_MNm"),
-    ("t [s],q1 [rad],qd1 [rad]\n0,1,2\n", r"the unit of 'qd1 \[rad\]' is not known"),
+    ("t [s],q1 [rad],qd1 [rad]\n0,1,2\n", r"'qd1 \[rad\]' has an unknown unit"),
     (b"\xff\xfe\x00t\x00,", "not a text file in UTF-8"),
     (HEADER.encode() + b"\x00\x00,1,2,3,4\n", "line"),
     (HEADER + f'"{"x" * 200_000}",1,2,3,4\n', "line 2 is not CSV"),

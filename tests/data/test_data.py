@@ -72,7 +72,7 @@ def test_saving_and_loading_is_the_identity(tmp_path):
     assert again.needs == data.needs
     for key in (*PER_SAMPLE, "label"):
         assert_array_equal(getattr(again, key), getattr(data, key))
-    for name, words in (("data.npz", "exists"), ("a/b.npz", "no such folder"), ("a.csv", r"end in \.npz")):
+    for name, words in (("data.npz", "exists"), ("a/b.npz", "no such folder"), ("a.csv", r"ends in \.npz")):
         with one_line(words):
             schema.save(tmp_path / name, data)
     older = {"joints": ["revolute"], "gravity": True, "friction": False, "actuation": None}

@@ -35,17 +35,17 @@ def test_statements_about_joints_are_checked():
     assert scale_torques(arrays, {"b": -2})["tau"].tolist() == [[1.0, -2.0]]
     three, arms = ["a", "b", "c"], ["left_elbow", "left_wrist", "right_elbow", "right_wrist"]
     for call, words in (
-        (lambda: select_names(three, ["d"]), "'d' is not among"),
+        (lambda: select_names(three, ["d"]), "'d' is not a joint"),
         (lambda: select_names(three, ["a="]), "lacks a name"),
         (lambda: select_names(three, ["a", "a"]), "names a joint twice"),
         (lambda: scale_torques(arrays, 0.0), "zero"),
-        (lambda: match_names(["elbow", "hip"], ["knee", "hip"]), r"'knee' is not among the data's \(elbow, hip\)"),
+        (lambda: match_names(["elbow", "hip"], ["knee", "hip"]), r"'knee' is not in the data \(elbow, hip\)"),
         (
             lambda: match_names(arms, ["elbow", "wrist"]),
             r"more than one way \(left_elbow=elbow, .*; right_elbow=elbow",
         ),
         (lambda: with_joints(NAMED, ("elbow", "slide", "wrist")), "have 2 joints, the robot 3"),
-        (lambda: with_joints(NAMED, ("elbow", "wrist")), "'wrist' is not among"),
+        (lambda: with_joints(NAMED, ("elbow", "wrist")), "'wrist' is not in the data"),
         (lambda: in_blocks(NAMED, 7), "has 6 samples, too few for 7"),
     ):
         with one_line(words):
@@ -67,8 +67,8 @@ def test_files_with_names_are_matched_and_say_so(tmp_path):
     q = np.stack([t, 2 * t, 3 * t], axis=1)
     np.savez(path, t=t, q=q)
     for stated, words in (
-        ({"joints": ["a"]}, "--joints needs the joints' names"),
-        ({"torque_factor": 2.0}, "scales tau, which the file lacks"),
+        ({"joints": ["a"]}, "--joints needs joint names"),
+        ({"torque_factor": 2.0}, "scales tau, but the file has no tau"),
         ({"topics": ["/a"]}, "--topics is for ROS bags"),
     ):
         with one_line(words):

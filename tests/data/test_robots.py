@@ -134,7 +134,7 @@ def test_joints_are_locked_at_their_positions(tmp_path):
 def test_a_gripper_whose_fingers_are_tied_and_a_free_base_can_be_locked(tmp_path):
     tied = ARM.replace('<parent link="two"/>', '<mimic joint="elbow"/><parent link="two"/>')
     path = written(tmp_path, "arm.urdf", tied)
-    with one_line(r"joint 'slide' follows another \(mimic\)"):
+    with one_line(r"joint 'slide' follows another joint \(mimic\)"):
         read_robot(path)
     assert read_robot(path, lock=["sl*"]).tree.names == ("shoulder", "elbow")
     with one_line(r"there is no joint 'finger\*' to lock; the joints are shoulder, elbow"):
@@ -262,5 +262,5 @@ def test_a_pipe_in_a_model_is_refused_and_not_waited_for(name, tmp_path):
     part = '<include file="parts/pipe.obj"/>' if name == "include" else asset
     (tmp_path / "part.xml").write_text(f"<mujoco>{part}</mujoco>")
     (tmp_path / "arm.xml").write_text('<mujoco><include file="part.xml"/></mujoco>')
-    with one_line("is no regular file"):
+    with one_line("is not a regular file"):
         read_robot(tmp_path / "arm.xml")

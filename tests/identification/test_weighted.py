@@ -101,7 +101,7 @@ def test_mistakes_are_named():
     few = compress(regressor(design(0, samples=2), np.ones((2, 2))))
     for given, settings, message in (
         (equations, {"noise": np.array([1.0, 0.0])}, "noise is"),
-        (few, {}, "2 samples of 2 joints for 5 parameters"),
+        (few, {}, "2 samples of 2 joints are too few for 5 parameters"),
         (Equations(np.zeros((2, 6, 6)), 300), {}, "tau is zero"),
     ):
         with one_line(message):

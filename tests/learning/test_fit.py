@@ -263,7 +263,7 @@ def test_torque_scale_never_divides_by_zero():
     data = generators.uniform(cart_pole(), samples=100)
     scale = torque_scale(data)
     assert scale[0] == pytest.approx(data.tau[:, 0].std()) and scale[1] == pytest.approx(scale[0])
-    with one_line("tau is constant in every training sample"):
+    with one_line("tau is constant in all training samples"):
         torque_scale(data._replace(tau=np.full_like(data.tau, 7.3)))
 
 
@@ -274,7 +274,7 @@ def test_settings_out_of_range_and_what_gauss_newton_does_not_take_are_refused()
         (line(), Adam(learning_rate=0.0), "learning_rate"),
         (line(), Adam(weight_decay=-1.0), "weight_decay"),
         (line(), GaussNewton(steps_per_dispatch=0), "steps_per_dispatch"),
-        (free, GaussNewton(), "residuals of a sample"),
+        (free, GaussNewton(), "needs residuals"),
         (free, Adam(), "neither a residual nor a loss"),
         (line()._replace(parameters=jnp.zeros(2, jnp.float32)), GaussNewton(), "parameters are float32"),
     ]:

@@ -108,7 +108,7 @@ def test_what_is_no_fit_is_refused():
     data = log_of("nothing")
     for laws, options, message in [
         (("coulomb",), {"cooling": True}, "cooling is 1.0, but friction has coulomb; add 'viscous' to it"),
-        (("viscous",), {"cooling": True}, "friction is to depend on temperature, which the data do not have"),
+        (("viscous",), {"cooling": True}, "friction by temperature needs temperatures, but the data have none"),
         (("coulomb",), {"noise": 0.0}, "noise is 0.0; expected a positive number"),
     ]:
         with one_line(message):

@@ -80,7 +80,7 @@ def test_recordings_that_do_not_fit_are_refused():
     for call, message in [
         (lambda: append_recording(append_recording(replay, *part), *part), "10 empty places for 20 samples"),
         (lambda: append_recording(replay, *part[:3], np.full_like(part[3], np.nan)), "not finite"),
-        (lambda: append_recording(replay, *part[:3], part[3][:, :1]), r"\(20, 1\).*expected the same \[n, 2\]"),
+        (lambda: append_recording(replay, *part[:3], part[3][:, :1]), r"\(20, 1\).*expected \[n, 2\] for all"),
         (lambda: empty_replay(0, 2), "capacity"),
     ]:
         with one_line(message):

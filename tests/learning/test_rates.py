@@ -87,7 +87,7 @@ def test_mistakes_are_named(swing):
         (lambda: rates_problem(model, data, data, seed=-1), "seed is -1"),
         (
             lambda: rates_problem(model, data._replace(p=None), data),
-            "the data have no p, which this model",
+            "the data have no p, but this fit needs it",
         ),
         (lambda: hold_out(data, 1.5, 0), "validation_share is 1.5"),
         (lambda: hold_out(data._replace(trajectory=0 * data.trajectory), 0.1, 0), "there are 1 trajectories"),

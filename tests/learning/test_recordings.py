@@ -64,7 +64,7 @@ def test_a_cut_off_that_takes_the_motion_away_is_not_chosen(recording, prepared)
 def test_mistakes_are_one_line(recording):
     for call, message in [
         (lambda: driven_torques(recording, delay=-0.5), r"delay is -0\.5"),
-        (lambda: prepare(recording._replace(needs=None)), "states no needs"),
+        (lambda: prepare(recording._replace(needs=None)), "and no needs"),
     ]:
         with one_line(message):
             call()

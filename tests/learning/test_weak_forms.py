@@ -53,10 +53,10 @@ def test_a_clean_motion_is_identified_without_accelerations():
 def test_what_windows_cannot_take_is_one_line():
     data = log(0)
     for given, settings, message in [
-        (data._replace(t=data.t**1.5), {}, "steps in time are not equal"),
+        (data._replace(t=data.t**1.5), {}, "windows need equal time steps"),
         (data, {"window": 9.0}, "as long as a window"),
         (data, {"window": 0.0}, "window is 0.0"),
-        (data, {"noise": np.array([1.0, 0.0])}, "a positive number for each of 2 joints"),
+        (data, {"noise": np.array([1.0, 0.0])}, "expected 2 positive numbers"),
     ]:
         with one_line(message):
             fit_momentum(MODEL, given, **settings)

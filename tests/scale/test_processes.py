@@ -245,7 +245,7 @@ REFUSED = [
     (None, "node1:5000", None, "--processes and --process-id missing beside --coordinator"),
     (2, "node1:5000", None, "--process-id missing beside --processes and --coordinator"),
     (None, None, 0, "missing beside --process-id"),
-    (1, "node1:5000", 0, "leave them out"),
+    (1, "node1:5000", 0, "leave out --coordinator"),
     (0, None, None, "expected a positive whole number"),
     (2, "node1:5000", 2, "expected 0 to 1"),
     (2, "node1:5000", -1, "expected 0 to 1"),

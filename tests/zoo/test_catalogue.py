@@ -130,11 +130,11 @@ def test_missing_keywords_are_refused_and_never_filled_in():
 
 def test_what_a_model_cannot_give_is_refused_with_what_it_can(tmp_path):
     for name, asked, message in (
-        ("phase-network", "dynamics", "a phase-network has no dynamics; ask for .flow"),
-        ("feed-forward", "flow", "a feed-forward has no flow; ask for .dynamics"),
-        ("structured-delan", "images", "a structured-delan has no images; ask for .dynamics or .flow"),
-        ("differential-network", "energies", "a differential-network has no energies; ask for .derivatives"),
-        ("latent-phase", "derivatives", "a latent-phase has no derivatives; ask for .images"),
+        ("phase-network", "dynamics", "a phase-network has no dynamics; use .flow"),
+        ("feed-forward", "flow", "a feed-forward has no flow; use .dynamics"),
+        ("structured-delan", "images", "a structured-delan has no images; use .dynamics or .flow"),
+        ("differential-network", "energies", "a differential-network has no energies; use .derivatives"),
+        ("latent-phase", "derivatives", "a latent-phase has no derivatives; use .images"),
     ):
         stored(tmp_path, name)
         with one_line(f"^{re.escape(message)}$"):
@@ -151,7 +151,7 @@ def test_functions_are_made_once_and_compute_in_the_precision_of_the_training(tm
     assert tau.dtype == run.flow.energy([1], [0.5]).dtype == jnp.float32
     # Parameters that were tuned are saved again.
     tuned = jax.tree.map(lambda leaf: 2 * leaf, run.parameters)
-    with one_line("has a model already"):
+    with one_line("already contains a model"):
         dln_jax.save(tmp_path, run.description, tuned)
     dln_jax.save(tmp_path, run.description, tuned, overwrite=True)
     jax.tree.map(assert_array_equal, dln_jax.load(tmp_path).parameters, tuned)
@@ -185,7 +185,7 @@ def test_a_model_of_ones_own_is_loaded_with_its_factory(tmp_path):
     description = describe(make_rod, needs=FREE, precision="f64")
     assert description["name"] == "own" and description["length"] == 2.0 and "rod" not in json.dumps(description)
     save(tmp_path, description, jnp.array([3.0]))
-    with one_line("give it as factory="):
+    with one_line("pass it as factory="):
         load(tmp_path, trust=True)
     run = load(tmp_path, factory=make_rod)
     assert_allclose(run.dynamics.mass_matrix([0.1]), [[12.0]])
@@ -198,7 +198,7 @@ def test_a_model_of_ones_own_is_loaded_with_its_factory(tmp_path):
 def test_a_factory_is_imported_by_name_only_when_it_is_trusted(tmp_path, module):
     save(tmp_path, describe("rods:make_rod", needs=FREE, precision="f64"), jnp.array([3.0]))
     sys.modules.pop("rods")
-    with one_line("made by rods:make_rod, which is not code of this package; give"):
+    with one_line("the factory rods:make_rod is not part of dln_jax; pass"):
         load(tmp_path)
     assert load(tmp_path, factory=make_rod) and not module()
     assert_allclose(load(tmp_path, trust=True).dynamics.mass_matrix([0.1]), [[12.0]])
@@ -212,8 +212,8 @@ def test_a_factory_is_imported_by_name_only_when_it_is_trusted(tmp_path, module)
 def test_mistakes_in_a_description_are_named():
     for message, name, keywords in (
         ("model is 'delan'; this release knows structured-delan", "delan", {}),
-        ("unknown are 'colour'", "structured-delan", {"colour": 1}),
-        ("which no file can hold", "black-box-hnn", {"initial_guess": jnp.sin}),
+        ("unknown keys 'colour'", "structured-delan", {"colour": 1}),
+        ("which JSON cannot store", "black-box-hnn", {"initial_guess": jnp.sin}),
         ("tau_scale is inf", "feed-forward", {"tau_scale": np.inf}),
     ):
         with one_line(message):

@@ -58,7 +58,7 @@ def test_it_comes_back_with_the_run(folder):
 
 
 def test_what_is_damaged_or_does_not_fit_is_refused(folder, tmp_path_factory):
-    with one_line("estimate it of that model"):
+    with one_line("estimate it for that model"):
         save_uncertainty(folder, known()._replace(factor=np.zeros((P + 1, 2))))
     save_uncertainty(folder, known())
     other = tmp_path_factory.mktemp("other")

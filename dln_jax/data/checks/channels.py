@@ -13,12 +13,11 @@ from dln_jax.types import JointSamples, JointVector, SampleIndex
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-"""error: a model learned from the data would be wrong, so commands that learn stop; warning: it would be less accurate
-than possible; note: for information."""
+"""An error would make a learned model wrong, so commands stop. A warning makes it less accurate. A note informs."""
 JITTER = 0.05
 """Largest standard deviation of the steps, relative to the step."""
 SLOWEST = 1.0
-"""Hz: at a lower rate t is hardly in seconds."""
+"""Hz: at a lower rate, t is probably not in seconds."""
 UNEQUAL = 0.2
 """Largest relative difference between the rates of trajectories."""
 TURNS = 4 * np.pi
@@ -38,8 +37,8 @@ CLEAR = 3.0
 ABRUPT = 0.5
 """A channel enters or leaves a clipping limit by more than this fraction of the typical step."""
 FAST, HIDDEN = 0.3, 0.5
-"""A joint moves if it is faster than the first multiple of its root mean square speed; zero torques in a larger share
-of such samples than the second are reported."""
+"""A joint moves if it is faster than the first multiple of its root mean square speed. Zero torques are reported if
+their fraction of these samples exceeds the second number."""
 FILTER = "interpolate to equal steps with smooth() or --cutoff auto"
 RADIAN = 180 / np.pi
 ALIKE = 0.9
@@ -47,7 +46,7 @@ ALIKE = 0.9
 UNLIKE = 0.5
 """Two signals with a lower correlation count as unrelated."""
 EXCHANGED = 0.3
-"""qd and qdd count as exchanged if the error as the other rate is below this fraction of the error as their own."""
+"""qd and qdd count as exchanged if exchanging them reduces the error below this fraction."""
 LATE = 0.5
 """Smallest delay reported, in samples."""
 FARTHEST = 0.25
@@ -66,7 +65,7 @@ class Finding(NamedTuple):
     """The observation, with numbers."""
     remedy: str
     joints: tuple[int, ...] = ()
-    """Joints concerned, counted from 0; empty if the finding concerns the whole log."""
+    """Affected joints, counted from 0; empty for the whole log."""
 
     @property
     def line(self) -> str:
@@ -75,13 +74,13 @@ class Finding(NamedTuple):
 
 
 Case = tuple[Severity, str, bool | np.bool_ | Bool[np.ndarray, " d"], str, str]
-"""Severity, check, whether it holds (for the whole log, or a mask of the joints concerned), observation and remedy."""
+"""Severity, check, whether it holds (for the whole log, or a mask of joints), observation and remedy."""
 
 
 def findings_of(*cases: Case) -> list[Finding]:
-    """Findings of the cases that hold.
+    """Returns the findings for the cases that hold.
 
-    "joint 3" or "joints 1, 2 and 4", counted from 1 as in figures, replaces {} in an observation on joints.
+    In an observation on joints, {} becomes "joint 3" or "joints 1, 2 and 4", counted from 1 as in figures.
     """
     findings = []
     for severity, check, concerned, observation, remedy in cases:
@@ -127,7 +126,7 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
         ("warning", "unexcited", still, "the position of {} is constant",
          "move it in some trajectories, or leave it out of q: its inertia and friction cannot be learned"),
         ("warning", "unexcited", (speed < WEAK * np.median(speed)) & ~still,
-         f"the speed of {{}} is less than {WEAK:.0%} of that of other joints",
+         f"{{}}: the speed is less than {WEAK:.0%} of the other joints' speed",
          "excite it more: the log hardly shows its dynamics"),
     )  # fmt: skip
     if "tau" not in data.estimated:
@@ -173,10 +172,10 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
 
 
 def _spikes(values: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
-    """Mask of samples [N, k] that leave a channel and return at once, by much more than it ever changes otherwise.
+    """Returns a mask [N, k] of spikes: samples that differ from their neighbours by much more than the usual change.
 
-    A sample is compared with the median of the two neighbours on either side. Upper quartiles of that error and of the
-    neighbours' range over all samples give the usual change.
+    The difference is to the median of the two neighbours on either side. The usual change comes from the upper
+    quartiles, over all samples, of this difference and of the neighbours' range.
     """
     mask = np.zeros(values.shape, bool)
     inside = np.flatnonzero(trajectory[4:] == trajectory[:-4]) + 2
@@ -191,9 +190,9 @@ def _spikes(values: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
 
 
 def flat_share(channel: np.ndarray, trajectory: np.ndarray, step: float) -> float:
-    """Fraction of samples in runs at the largest or smallest value that are entered or left abruptly.
+    """Returns the fraction of samples in runs at the largest or smallest value with an abrupt start or end.
 
-    A smooth extreme is approached ever more slowly and a joint at rest does not move; a limit cuts a motion off.
+    A motion slows down towards a smooth extreme, and a joint at rest does not move, but a limit cuts a motion off.
     `step` is the channel's step size.
     """
     size = np.ptp(channel)
@@ -216,10 +215,10 @@ def flat_share(channel: np.ndarray, trajectory: np.ndarray, step: float) -> floa
 
 
 def _match(measured: JointSamples, derived: JointSamples, part: SampleIndex, farthest: int) -> tuple[JointVector, ...]:
-    """Least-squares match of two signals in every channel, measured(t) = factor * derived(t - delay).
+    """Matches two signals in every channel by least squares: measured(t) = factor * derived(t - delay).
 
-    Returns the factors, the delays in samples, the correlations, and the squared error without delay divided by that
-    at the delay.
+    Returns the factors, the delays in samples, the correlations, and the ratio of the squared errors without and with
+    the delay.
     """
     shifts, columns = np.arange(-farthest, farthest + 1), np.arange(measured.shape[1])
     inside = away_from_ends(part, farthest)
@@ -240,7 +239,7 @@ def _match(measured: JointSamples, derived: JointSamples, part: SampleIndex, far
 
 
 def vertex(values: np.ndarray, lowest: int | np.integer) -> float:
-    """Offset of the minimum of the parabola through the lowest value and its neighbours, in steps."""
+    """Fits a parabola to the lowest value and its neighbours; returns the offset of its minimum in steps."""
     if not 0 < lowest < len(values) - 1:
         return 0.0
     before, here, after = values[lowest - 1 : lowest + 2]
@@ -249,7 +248,7 @@ def vertex(values: np.ndarray, lowest: int | np.integer) -> float:
 
 
 def away_from_ends(part: SampleIndex, farthest: int) -> Int[np.ndarray, " n"]:
-    """Indices of samples with `farthest` neighbours of the same part on either side."""
+    """Returns the indices of samples with `farthest` neighbours of the same part on either side."""
     places = np.arange(farthest, len(part) - farthest)
     return places[(part[places - farthest] == part[places]) & (part[places + farthest] == part[places])]
 
@@ -277,8 +276,8 @@ def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
         farthest = max(2, min(round(FARTHEST * even.rate), 40, len(measured) // 8))
         factor, delay, correlation, gained = _match(measured, own, part, farthest)
         alike = (np.abs(correlation) > ALIKE) & moves
-        # Noise of the derived signal lowers the least-squares factor, noise of the measured one does not: the true
-        # factor lies between the regressions of either signal on the other.
+        # Noise in the derived signal lowers the least-squares factor, but noise in the measured one does not. The true
+        # factor lies between the two regressions of one signal on the other.
         least = np.abs(factor)
         most = least / np.maximum(correlation**2, TINY)
         degrees, radians, milli, right = (
@@ -309,7 +308,7 @@ def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
 
 
 def _at_times_of(data: Trajectories, even: Smoothed, values: np.ndarray) -> np.ndarray:
-    """Columns of a log at the times of its smoothed samples, by linear interpolation."""
+    """Interpolates columns of a log linearly at the times of its smoothed samples."""
     rows = np.empty((len(even.data.t), values.shape[1]))
     sources = {str(label): index for index, label in enumerate(data.label)}
     for index, label in enumerate(map(str, even.data.label)):

@@ -1,8 +1,8 @@
-"""Bayesian evidence for explanations of a log's torques, and the torques of an unknown robot as a Gaussian process.
+"""Compares explanations of a log's torques by Bayesian evidence, with a Gaussian process for unknown robots.
 
 An explanation is a Gaussian prior of all torques: a mean, and a sum of covariances weighted by variances. The weights
-maximise the likelihood (minorisation-maximisation: Zhou et al., arXiv 1509.07426). Explanations are compared by the
-probability of every block of time conditional on all others, so a fault counts only if it shows in most of the log.
+maximise the likelihood (minorisation-maximisation: Zhou et al., arXiv 1509.07426). The score of an explanation is the
+probability of each block of time given all others, so a fault counts only if it shows in most of the log.
 
 The torques of an unknown robot derive from one Lagrangian T(q, qd) - V(q) for all joints. With
 
@@ -10,11 +10,11 @@ The torques of an unknown robot derive from one Lagrangian T(q, qd) - V(q) for a
 
 and kernels that are products over the coordinates, the torques d/dt dT/dqd - dT/dq + dV/dq are jointly Gaussian with a
 closed-form covariance (the construction of Giacomuzzo et al., arXiv 2310.06585). The prior contains every tree of rigid
-bodies with revolute joints. Most arms are chains with columns ordered from base to tip: the energy of a body then
-depends on the joints below it only, and its kinetic energy not on the first joint. Such energies have weights of their
-own, so few samples suffice for chains, and the general energies remain for all other robots. Forces A(q) qd with an
-antisymmetric A, as of magnetic fields and flywheels, belong to no T - V and have a covariance of their own. Each joint
-adds its own friction: viscous, dry on two scales, and an offset.
+bodies with revolute joints. Most arms are chains with columns ordered from base to tip. The energy of a body then
+depends only on the joints below it, and its kinetic energy does not depend on the first joint. These energies have
+separate weights, so few samples are enough for chains; the general energies cover all other robots. Forces A(q) qd with
+an antisymmetric A, for example from magnetic fields and flywheels, do not derive from T - V and have a covariance of
+their own. Each joint adds friction: viscous, dry on two scales, and an offset.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,7 +27,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.types import JointVector
 
 ITERATIONS = 12
-"""Iterations of the likelihood maximisation; one digit of the weights is enough."""
+"""Iterations of the likelihood maximisation; the weights need one digit."""
 BLOCKS = 10
 WEIGHED = 300
 """Largest number of torques used to find the weights; predictions use all."""
@@ -46,7 +46,7 @@ SCALES = (0.02, 0.3)
 
 
 class Hypothesis(NamedTuple):
-    """A log, and the faults that are repaired in it."""
+    """A log, and the faults repaired in it."""
 
     data: Trajectories
     rows: np.ndarray
@@ -58,7 +58,7 @@ class Hypothesis(NamedTuple):
     delay: float = 0.0
     """Delay of the torques in samples."""
     speed: float = 1.0
-    """True speed of the joints, relative to the speed that t implies."""
+    """True speed of the joints relative to the speed by t."""
     gravity: np.ndarray | None = None
     """m/s² [3]; `None` for the stated gravity."""
 
@@ -73,13 +73,13 @@ class Hypothesis(NamedTuple):
         ]
 
     def torques(self, shift: int = 0) -> np.ndarray:
-        """Torques of the joints with repaired signs and order, `shift` samples later."""
+        """Torques of the joints `shift` samples later, with repaired signs and order."""
         return self.data.tau[self.rows + shift][:, list(self.order)] * self.signs
 
 
 Inertias = tuple[np.ndarray, list[np.ndarray], list[np.ndarray], int]
-"""Mean of inertial torques [d], their covariances with the torques [d, n d] and with themselves [d, d], and the place
-of the first weight of these."""
+"""Mean of inertial torques [d], their covariances with the torques [d, n d] and with themselves [d, d], and the index
+of the first of their weights."""
 
 
 class Prior(NamedTuple):
@@ -139,7 +139,7 @@ def explain(log: Hypothesis, prior: Prior, *, iterations: int = ITERATIONS) -> E
 def _likeliest(
     parts: list[np.ndarray], factors: list[np.ndarray], y: np.ndarray, noise: np.ndarray, d: int, iterations: int
 ) -> np.ndarray:
-    """Weights of parts, factors and noise [w]; the likelihood grows in every iteration."""
+    """Returns the weights of parts, factors and noise [w]; the likelihood grows in every iteration."""
     traces = [np.mean(np.diag(part) / noise) for part in parts]
     traces += [np.mean(np.sum(columns**2, axis=1) / noise) for columns in factors]
     start = np.mean(y**2 / noise) / np.maximum(traces, 1e-300) / max(len(traces), 1)
@@ -159,7 +159,7 @@ def _likeliest(
 def _inverse_covariance(
     parts: list[np.ndarray], factors: list[np.ndarray], weights: np.ndarray, noise: np.ndarray
 ) -> np.ndarray:
-    """Inverse of the covariance with these weights of parts, factors and noise."""
+    """Inverts the covariance with these weights of parts, factors and noise."""
     from scipy.linalg.lapack import dpotrf, dpotri  # pyright: ignore[reportAttributeAccessIssue]
 
     of_parts, of_factors, of_noise = np.split(weights, [len(parts), len(parts) + len(factors)])
@@ -183,7 +183,7 @@ def blocks_of(n: int, d: int) -> list[np.ndarray]:
 
 
 def any_energy(joints: Sequence[str]) -> Build:
-    """Prior without a robot: torques of an arbitrary kinetic and potential energy, gyroscopic forces and friction."""
+    """Returns the prior without a robot: any kinetic and potential energy, gyroscopic forces and friction."""
 
     def build(log: Hypothesis) -> Prior:
         states = log.states()
@@ -220,7 +220,7 @@ def gyroscopic(log: Hypothesis, joints: Sequence[str]) -> list[Float[np.ndarray,
 
 
 def sizes_of(log: Hypothesis) -> np.ndarray:
-    """Magnitudes of the joints' inertias [d] as the ratio of torques to accelerations."""
+    """Estimates the magnitude of each joint's inertia [d] as the ratio of torques to accelerations."""
     ratios = log.torques().std(axis=0) / np.maximum(log.states()[2].std(axis=0), 1e-12)
     return np.maximum(ratios, 1e-3 * max(float(ratios.max()), 1e-300))
 
@@ -228,7 +228,7 @@ def sizes_of(log: Hypothesis) -> np.ndarray:
 def covariances(
     states: Sequence[np.ndarray], others: Sequence[np.ndarray], joints: Sequence[str], sizes: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Covariances [n d, m d] of the torques of kinetic and potential energies: of any robot, then of bodies of a chain.
+    """Returns torque covariances [n d, m d] for kinetic and potential energies of any robot, then of a chain's bodies.
 
     Args:
         states, others: q, qd and qdd [n, d].

@@ -30,16 +30,16 @@ from dln_jax.types import InputError
 MOST_SHIFTS = 20
 """Largest delay between q and tau tested, in samples."""
 EQUATIONS, EACH = 300, 100
-"""Number of torques used to search for faults: the minimum over all joints, and the number per joint."""
+"""Number of torques in the search for faults: the minimum over all joints, and the number per joint."""
 BLINDING = ("saturation-tau", "saturation-q", "dead-torque", "constant-torque", "unexcited")
-"""Without a robot, torques are not examined if one of these findings is present."""
+"""Findings that rule out an examination of the torques without a robot."""
 WIDTH = 10
 """Characters per column of the report's table."""
-ESTIMATED = "--cutoff auto, or data.encoders.smooth(), filters q before rates are derived"
+ESTIMATED = "--cutoff auto, or data.encoders.smoothing.smooth(), filters q before rates are derived"
 
 
 class Examination(NamedTuple):
-    """Findings, and the intermediate results behind them."""
+    """Findings with the results behind them."""
 
     findings: list[Finding]
     """Most severe first."""
@@ -79,7 +79,7 @@ def read(path: str | Path, **stated: Any) -> tuple[Trajectories, list[Finding]]:
 
 
 def quick(data: Trajectories, robot: Robot | None = None) -> list[Finding]:
-    """Findings of all checks, most severe first; arguments as for `examine`."""
+    """Returns the findings of all checks, most severe first; arguments as for `examine`."""
     return examine(data, robot).findings
 
 
@@ -87,7 +87,7 @@ def examine(data: Trajectories, robot: Robot | None = None, *, repaired: Sequenc
     """Runs all checks.
 
     Args:
-        data: log as it was read.
+        data: the log before any filter.
         robot: description of the robot, with the joints of the data.
         repaired: findings of `read`.
 
@@ -121,8 +121,8 @@ def examine(data: Trajectories, robot: Robot | None = None, *, repaired: Sequenc
          "resample over them with smooth() or --cutoff auto"),
     )  # fmt: skip
     try:
-        even = smooth(data, trim=0.0)  # which removes the repeats itself, and knows where they were
-    except InputError:  # single states, or motions of a few samples: their rates cannot be checked
+        even = smooth(data, trim=0.0)  # removes the repeats and records their places
+    except InputError:  # too few samples to check rates
         even = None
     if even is not None and even.clock is not None:
         findings = [finding for finding in findings if finding.check != "jitter"]
@@ -134,8 +134,8 @@ def examine(data: Trajectories, robot: Robot | None = None, *, repaired: Sequenc
     if even is not None:
         findings += [*_noise(distinct, even), *check_derivatives(distinct, even)]
         findings += check_degrees(even.data, joints, driven=driven)
-        # Wrong units, and channels that are clipped or dead, make the signs of torques inconclusive. Every torque must
-        # vary and act on its coordinate directly.
+        # With wrong units or clipped or dead channels, the signs of torques are inconclusive. Every torque must vary
+        # and act on its coordinate directly.
         sound = not any(finding.severity == "error" or finding.check in BLINDING for finding in findings)
         direct = needs is None or (needs.actuation is None and needs.joint_map is None)
         if driven and sound and robot is None and direct and np.ptp(distinct.tau, axis=0).all():
@@ -160,12 +160,12 @@ def _noise(data: Trajectories, even: Smoothed) -> list[Finding]:
     share = np.max(amplified * even.rate / np.maximum(even.data.qdd.std(axis=0), np.finfo(float).tiny))
     estimated = "qdd" in data.estimated or "qd" in data.estimated
     noisy = estimated and np.isfinite(even.cutoff) and even.choice is not None and share >= 0.05
-    observation = f"accelerations by differences of this q have noise of {100 * share:.0f} % of their size"
+    observation = f"accelerations differenced from q are {100 * share:.0f} % noise"
     return findings_of(("warning", "raw-differences", noisy, observation, ESTIMATED))
 
 
 def report(examined: Examination, name: str) -> list[str]:
-    """Lines of text; findings come last, most severe first."""
+    """Returns the lines of the report; findings come last, most severe first."""
     findings, data, smoothed, torques, on_tree = examined
     count = len(np.unique(data.trajectory))
     lines = [f"{name}: {len(data.t)} samples of {count} trajectories, {data.degrees_of_freedom} joints", *data.remarks]
@@ -180,17 +180,20 @@ def report(examined: Examination, name: str) -> list[str]:
     lines += ["", *_table(examined), ""]
     if on_tree is not None:
         determined = f"the motions determine {on_tree.rank} of {on_tree.parameters} parameters, friction included"
-        lines += [f"robot: {determined} (some are never determined alone); condition {on_tree.condition:.3g}", ""]
+        lines += [
+            f"robot: {determined} (some cannot be determined individually); condition {on_tree.condition:.3g}",
+            "",
+        ]
     if torques is not None:
-        by = "parameters near the robot's" if on_tree is not None else "an energy of any arm and friction"
+        by = "a model near the robot's file" if on_tree is not None else "a generic arm model with friction"
         lines.append(
-            f"torques: {by} predict {torques.explained.mean():.1%} of the variance in left-out blocks; the likeliest "
-            f"delay is {torques.likely_delay:.2f} samples"
+            f"torques: {by} explains {torques.explained.mean():.1%} of the variance in left-out blocks; the most "
+            f"likely delay is {torques.likely_delay:.2f} samples"
         )
     elif "tau" not in data.estimated:
-        lines.append("torques: signs, order of columns and delay cannot be checked in this log")
+        lines.append("torques: this log does not allow a check of signs, column order and delay")
     if not findings:
-        lines.append("nothing was found")
+        lines.append("no faults found")
     return [*lines, *(finding.line for finding in findings)]
 
 

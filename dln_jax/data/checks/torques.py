@@ -1,11 +1,11 @@
 """Tests hypotheses about faults in torques: a wrong sign, exchanged columns, a delay and others.
 
-A hypothesis is accepted if it predicts left-out blocks of time much better than the log as recorded, in nearly all
-blocks. Without a robot, the torques have the prior of an arbitrary energy with friction (`priors`), valid for arms of
-any kinematics; a robot's file gives a narrower prior (`tree`). The best supported fault is repaired, then the next.
+A hypothesis is accepted if it predicts nearly all left-out blocks of time much better than the recorded log does.
+Without a robot, the prior of the torques is an arbitrary energy with friction (`priors`), valid for arms of any
+kinematics. A robot's file gives a narrower prior (`tree`). The fault with the most support is repaired, then the next.
 
-Priors are Gaussian, so they also hold impossible robots. A repair that needs negative inertia or friction that drives
-is none, and joints whose inertia is negative beyond doubt have torques of the wrong sign.
+Priors are Gaussian, so they include impossible robots. Repairs that need negative inertia or driving friction are
+discarded. Torques of joints with significantly negative inertia have the wrong sign.
 """
 
 import functools
@@ -22,26 +22,25 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.types import JointVector
 
 DECISIVE = 15.0
-"""Log likelihood ratio over all blocks that is required to decide: odds of three million to one."""
+"""Log likelihood ratio over all blocks for a decision: odds of three million to one."""
 MOST_BLOCKS = 0.8
 """Fraction of blocks that must agree."""
 BETTER = 0.8
-"""A change of sign or order must lower the unexplained variance to this fraction. With a robot the variance is that of
-all joints, since its parameters couple them; without one it is that of the joints whose torques change."""
+"""A change of sign or order must lower the unexplained variance to this fraction. With a robot, all joints count, since
+its parameters couple them; without one, the changed joints count."""
 LESS_LATE = 0.95
 """The same for a delay."""
 EXPLAINED = 0.02
-"""Signs and order of torques are right if less than this fraction of each one's variance is unexplained as recorded."""
+"""Signs and order of the recorded torques are right if less than this fraction of each variance is unexplained."""
 LATE = 0.2
 """Smallest delay reported, in samples."""
 MOST_FAULTS = 3
 SCANNED, ROUGHLY, CANDIDATES = 250, 3, 2
-"""Ranking of single faults: equations, iterations, and the number of faults of a kind that are then tested fully."""
+"""Ranking of single faults: equations, iterations, and the number of faults of each kind that are tested fully."""
 INERTIAS = 8
 """Number of configurations for testing the sign of the inertias."""
 NEGATIVE = -5.0
-"""An inertia, the sum of them over joints, or the power lost to friction is negative if it is below this many standard
-deviations."""
+"""An inertia, their sum, or the power lost to friction counts as negative below this many standard deviations."""
 TRUSTED = 0.8
 """Fraction of a torque's variance that must be predicted before its friction is reported."""
 DRY = 0.02
@@ -122,7 +121,7 @@ def examine_torques(
 
 
 def _sampled(data: Trajectories, farthest: int, equations: int) -> Hypothesis | None:
-    """Samples for so many equations, with room for the delay; `None` with too few."""
+    """Selects samples for this number of equations, with room for the delay; `None` with too few."""
     d = data.degrees_of_freedom
     inside = away_from_ends(data.trajectory, farthest + 1)
     count = min(equations // d, len(inside))
@@ -132,7 +131,7 @@ def _sampled(data: Trajectories, farthest: int, equations: int) -> Hypothesis | 
 
 
 def _late(now: Explanation, farthest: int) -> tuple[np.ndarray, float]:
-    """Loss of every delay at the same weights, and the best delay with subsample resolution."""
+    """Returns the loss of every delay at the same weights, and the best delay with subsample resolution."""
     trials = [now.log.torques(), *(now.log.torques(shift) for shift in range(-farthest, farthest + 1))]
     pull = now.inverse @ (np.stack([trial.ravel() for trial in trials], axis=1) - now.prior.mean[:, None])
     losses = []
@@ -148,7 +147,7 @@ def _late(now: Explanation, farthest: int) -> tuple[np.ndarray, float]:
 def _better(
     now: Explanation, build: Build, farthest: int, others: Callable[[Hypothesis], list[Hypothesis]], *, alone: bool
 ) -> Explanation | None:
-    """The log with its likeliest fault repaired, if that is decisive; `alone` judges by the joints concerned."""
+    """Repairs the most likely fault of a log if it is decisive; `alone` judges by the affected joints."""
     log, d = now.log, len(now.log.order)
     flips = [log._replace(signs=np.where(np.arange(d) == joint, -log.signs, log.signs)) for joint in range(d)]
     exchanges = []
@@ -165,7 +164,7 @@ def _better(
     for trial in trials:
         then = explain(trial, build(trial))
         if not np.array_equal(trial.signs, log.signs):
-            # Turning one torque or all those coupled to it explains a log alike.
+            # Reversing one torque, or all torques coupled to it, explains a log equally well.
             then = _with_positive_inertias(then, build)
         limit = LESS_LATE if trial.delay != log.delay else BETTER
         concerned = (then.log.signs != log.signs) | (np.array(trial.order) != np.array(log.order))
@@ -182,7 +181,7 @@ def _better(
 
 
 def _likeliest(log: Hypothesis, trials: list[Hypothesis], build: Build) -> list[Hypothesis]:
-    """The few faults that are likelier than the log as recorded, judged from fewer samples and rough weights."""
+    """Returns the few faults that are more likely than none, judged from fewer samples and rough weights."""
     if not trials:
         return []
     rows = log.rows[:: -(-len(log.rows) * len(log.order) // SCANNED)]
@@ -197,7 +196,7 @@ def _likeliest(log: Hypothesis, trials: list[Hypothesis], build: Build) -> list[
 
 
 def decisive(now: Explanation, other: Explanation, limit: float, joints: np.ndarray) -> bool:
-    """Whether another explanation is better beyond doubt, and by enough to matter for these joints."""
+    """Whether another explanation is significantly better, and by enough to matter for these joints."""
     gains = other.densities - now.densities
     return bool(
         gains.sum() > DECISIVE
@@ -207,7 +206,7 @@ def decisive(now: Explanation, other: Explanation, limit: float, joints: np.ndar
 
 
 def _with_positive_inertias(now: Explanation, build: Build) -> Explanation:
-    """The log with the signs of torques changed where inertias are negative beyond doubt, if that fits as well."""
+    """Changes the signs of torques with significantly negative inertias, if the log fits equally well."""
     log = now.log
     if not np.ptp(log.torques(), axis=0).all():  # a torque that stays the same contradicts every robot
         return now
@@ -227,7 +226,7 @@ def _impossible(now: Explanation) -> np.ndarray:
 
 
 def _inertias(now: Explanation) -> JointVector:
-    """Mean inertia of every joint divided by its standard deviation."""
+    """Returns the mean inertia of every joint divided by its standard deviation."""
     q, d = now.log.states()[0], len(now.log.order)
     q = np.repeat(q[np.linspace(0, len(q) - 1, INERTIAS).astype(int)], d, axis=0)
     pushed = q, np.zeros_like(q), np.tile(np.eye(d), (INERTIAS, 1))
@@ -240,8 +239,8 @@ def _inertias(now: Explanation) -> JointVector:
 
 
 def _friction(now: Explanation) -> tuple[np.ndarray, ...]:
-    """Viscous and dry friction, the error of the latter, its velocity scale, torques of friction and noise only, and
-    the power lost in standard deviations."""
+    """Returns viscous friction, dry friction, its error and velocity scale, the torques of friction and noise, and the
+    lost power in standard deviations."""
     tau, qd = now.log.torques(), now.log.states()[1]
     n, d = tau.shape
     typical = np.maximum(qd.std(axis=0), 1e-12)
@@ -271,7 +270,7 @@ def check_torques(torques: Torques, *, friction_stated: bool, with_robot: bool) 
          f"the torque of {{}} has the wrong sign ({torques.gain})", "change the sign of that tau or that q"),
         ("error", "order", np.array(log.order) != np.arange(len(log.order)),
          f"the torques of {{}} are exchanged: columns {columns} of tau fit q ({torques.gain})",
-         "order the columns of tau as those of q"),
+         "order the columns of tau like the columns of q"),
         ("warning", "delay", log.delay != 0, f"torques are {late} relative to positions ({torques.gain})",
          "shift one of them in time, or correct the clock of the log"),
     )  # fmt: skip
@@ -287,7 +286,7 @@ def check_torques(torques: Torques, *, friction_stated: bool, with_robot: bool) 
 
 
 def check_degrees(data: Trajectories, joints: tuple[str, ...], *, driven: bool) -> list[Finding]:
-    """Reports angles so large that they may be in degrees, or motor angles."""
+    """Reports very large angles, which may be in degrees or on the motor's side."""
     largest = np.abs(data.q).max(axis=0)
     large = np.array([kind == "revolute" for kind in joints]) & (largest > TURNS)
     if not large.any():

@@ -28,16 +28,16 @@ EXPLAINED = 0.02
 BETTER = 0.3
 """Another order of the joints must lower the unexplained variance to this fraction."""
 RELATED = 0.5
-"""A measured torque whose correlation with the tree's torque, without friction, is higher belongs to the same joint."""
+"""A measured torque belongs to a joint if its correlation with the tree's torque, without friction, is higher."""
 GEAR = 5.0
 """A measured torque that exceeds the model's by more than this factor (or falls below its inverse) was probably
 measured on the other side of the gear."""
 TILTED = 4.0
 """Larger angles between the data's gravity and the description's, in degrees, are tested as a tilt."""
 HELD = 0.3
-"""Torques with a smaller fraction of the tree's gravity, and inertial forces of a credible size, may hold none."""
+"""Torques with a smaller fraction of the tree's gravity, but credible inertial forces, may have it removed."""
 PACE = 0.03
-"""A wrong clock is tested if the log ratio of the speeds that the robot and t imply is larger."""
+"""A wrong clock is tested if the logarithm of the ratio of the robot's speed to the speed by t is larger."""
 LENGTH = 0.1
 """m: uncertainty of a body's centre of mass relative to its file."""
 ILL = 1000.0
@@ -45,7 +45,7 @@ ILL = 1000.0
 RANK = 1e-7
 """Singular values below this fraction of the largest count as undetermined."""
 LEFT = 1e-5
-"""A joint whose friction and rotor leave less than this fraction of its torque says nothing of units."""
+"""A joint is no evidence on units if friction and rotor explain all but this fraction of its torque."""
 FRICTION_SCALE = 0.05
 """Smoothing velocity of dry friction, relative to the typical velocity of the joint."""
 
@@ -58,9 +58,9 @@ class OnTree(NamedTuple):
     """Number of combinations of tree and friction parameters that the motions determine."""
     parameters: int
     condition: float
-    """Condition of the scaled columns within the rank."""
+    """Condition number of the scaled columns within the rank."""
     scale: np.ndarray
-    """Measured torque over the tree's, without friction [d]; NaN without torques."""
+    """Ratio of the measured torque to the tree's, without friction [d]; NaN without torques."""
     gravity: np.ndarray
     """Gravity that explains the data best, in the ground frame, m/s² [3]; NaN if it cannot be estimated."""
     torques: Torques | None
@@ -109,8 +109,8 @@ def compare_with_tree(
         return OnTree(findings, *facts, np.full(d, np.nan), np.full(3, np.nan), None)
     still = np.zeros_like(q)
     weight = [phi(q, still, still, axis) @ theta for axis in np.eye(3)]
-    # Inertial forces with Coriolis, gravity of 1 m/s² along each axis, and measured torques, without what friction and
-    # rotors explain. Files of robots rarely hold the rotors' inertia, so it is no evidence for wrong units, clocks or
+    # Inertial and Coriolis forces, gravity of 1 m/s² along each axis, and measured torques, after projecting out
+    # friction and rotors. Robot files rarely state the rotors' inertia, so it is no evidence of wrong units, clocks or
     # orders.
     forces = np.stack([phi(q, qd, qdd, np.zeros(3)) @ theta, *weight, tau], axis=2) / sizes[:, None]
     rubbing = np.concatenate([losses, qdd.T[..., None]], axis=2)
@@ -146,7 +146,7 @@ def compare_with_tree(
 
 
 def _names_and_limits(data: Trajectories, robot: Robot, names: tuple[str, ...]) -> list[Finding]:
-    """Checks joint names and their order, if both have names, and that positions are within the robot's limits."""
+    """Checks the names and order of joints, if both have names, and the position limits."""
     stated = robot.tree.names
     unlike, same = bool(names and stated and names != stated), set(names) == set(stated)
     both = f"the data's joints are {', '.join(names):.200}, the robot's {', '.join(stated):.200}"
@@ -192,11 +192,11 @@ def _program(parents: tuple[int, ...], joints: tuple[JointKind, ...], axes: tupl
 def near_tree(
     phi: Callable[..., np.ndarray], theta: np.ndarray, down: np.ndarray, joints: tuple[JointKind, ...]
 ) -> Build:
-    """Prior of the torques of a tree with bodies near those of its file, any rotors, gyroscopic forces and friction."""
+    """Returns the prior of a tree with bodies near the file's, any rotors, gyroscopic forces and friction."""
     d = len(theta) // 11
     bodies = np.abs(theta[: 10 * d]).reshape(d, 10)
     mass = np.maximum(bodies[:, :1], 1e-3 * bodies[:, :1].max())
-    # If the file is wrong by a body's own mass, its centre of mass and inertia are off by these amounts.
+    # If a mass in the file is wrong by 100 %, the centre of mass and inertia are off by these amounts.
     spread = np.hstack([mass, mass * LENGTH * np.ones((1, 3)), mass * LENGTH**2 * np.ones((1, 6))])
     sizes = np.maximum(bodies, spread).ravel()
 
@@ -223,7 +223,7 @@ def near_tree(
 def _mounted_or_paced(
     log: Hypothesis, inertial: float, estimate: np.ndarray, down: np.ndarray, *, of_clock: bool
 ) -> list[Hypothesis]:
-    """The log without gravity or of a robot with its base turned, and at another speed, as the data suggest."""
+    """Returns logs without gravity, with a turned base, or at another speed, if the data suggest it."""
     if log.gravity is not None:
         return []
     logs = []
@@ -243,14 +243,14 @@ def _mounted_or_paced(
 def _base_and_clock(torques: Torques, down: np.ndarray) -> list[Finding]:
     gravity, speed = torques.repaired.log.gravity, torques.repaired.log.speed
     if gravity is not None and not gravity.any():
-        observation = f"tau holds no gravity ({torques.gain}): the robot's driver removes it"
+        observation = f"tau does not include gravity ({torques.gain}): the robot's driver removes it"
         return [Finding("warning", "no-gravity", observation, "models are fitted without gravity; add it to commands")]
     if gravity is not None:
         estimate = "(" + ", ".join(f"{number:.1f}" for number in np.round(gravity, 1) + 0.0) + ")"
         observation = f"gravity is tilted by {_angle(gravity, down):.0f} degrees"
         remedy = "state how the base is mounted, or check where joints have zero"
         if gravity @ down < 0 and _angle(gravity, -down) < 2 * TILTED:
-            observation = "gravity points the other way"
+            observation = "gravity has the opposite direction"
             remedy = "reverse gravity in the description, or check how the arm is mounted and where joints have zero"
         observation += f": the data imply {estimate} m/s² ({torques.gain})"
         return [Finding("error", "gravity", observation, remedy)]
@@ -276,7 +276,7 @@ def _better_order(
     samples: tuple[np.ndarray, ...],
     friction: np.ndarray,
 ) -> list[Finding]:
-    """Searches for a joint order that explains the torques much better: two joints exchanged, all reversed or rotated.
+    """Searches for a better joint order: two joints exchanged, all reversed, or all rotated.
 
     `samples` are q, qd, qdd and tau [n, d], `friction` the columns of friction and rotors [d, n, k].
     """

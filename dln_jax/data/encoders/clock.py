@@ -1,12 +1,12 @@
-"""Times on the clock of a log's source, for regular rows that were stamped when they arrived.
+"""Recovers the times of regular samples that were stamped on arrival.
 
 A program that reads a robot over a network stamps each row late, by a varying time. Measured positions and velocities
-give the time for which the robot moved between two rows:
+give the true time between two rows:
 
     step = sum_j w_j dq_j v_j / sum_j w_j v_j²,    v the mean of both rows' qd,    1 / w_j = mean of qd_j²
 
-If these steps are whole multiples of one period and the stamps are not, rows are moved to the multiples. Where the
-robot hardly moves, they are interpolated. All times are late by the mean lateness of the stamps.
+If these steps are whole multiples of one period and the stamps are not, rows are moved to the multiples, and
+interpolated where the robot hardly moves. The mean lateness of the stamps remains.
 """
 
 from collections.abc import Iterable
@@ -19,24 +19,24 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.types import SampleVector
 
 JITTER = 0.05
-"""Smallest standard deviation of the stamps' steps that is repaired, in periods."""
+"""Stamps are repaired if the standard deviation of their steps exceeds this fraction of a period."""
 REGULAR, SHARE = 0.1, 0.98
-"""Largest deviation of a step from a whole number of periods, and the share of the steps that keeps within it."""
+"""Largest deviation of a step from a whole number of periods, and the fraction of steps that must meet it."""
 BETTER = 0.3
-"""Largest standard deviation of the steps from whole numbers, relative to that of the stamps."""
+"""The computed steps must scatter about whole numbers by less than this fraction of the scatter of the stamps."""
 MOVING = 0.3
 """Steps are computed where the joints move faster than this multiple of their root mean square speed."""
 LEAST = 100
-"""Fewest steps that tell a period."""
+"""Fewest steps from which a period is estimated."""
 SAME = 0.02
-"""Largest relative difference of the total durations by steps and by stamps: beyond, units of qd or t are in doubt."""
+"""Largest relative difference of the total durations by steps and by stamps; a larger one suggests wrong units."""
 NEAR = 100
-"""Number of rows on either side of a gap between counted steps whose lateness is compared."""
+"""Rows on either side of a gap between counted steps for comparing the lateness."""
 LATE = 0.1
 """s: largest correction of a stamp."""
 
 Counts = tuple[np.ndarray, np.ndarray]
-"""Indices of rows, and the whole number of periods from the first of them to each."""
+"""Indices of rows, and the number of periods from the first row to each."""
 
 
 class Clock(NamedTuple):
@@ -52,17 +52,17 @@ class Clock(NamedTuple):
     def line(self) -> str:
         """Jitter of the stamps and steps of the source, in words."""
         return (
-            f"t jitters by {self.jitter:.0%} of a step, but by q and qd the rows are whole multiples of "
+            f"t jitters by {self.jitter:.0%} of a step, but q and qd show that rows are whole multiples of "
             f"{1e3 * self.period:.4g} ms apart"
         )
 
 
 def source_clock(data: Trajectories, interpolated: Bool[np.ndarray, " N"] | None = None) -> Clock | None:
-    """Returns the times on the source's clock; `None` if stamps are regular, or the motions do not tell otherwise.
+    """Returns the times on the source's clock; `None` if stamps are regular or the motions do not determine the times.
 
     Args:
         data: rows without repeats, with measured qd.
-        interpolated: rows whose q was not measured.
+        interpolated: rows with interpolated instead of measured q.
     """
     known = np.arange(len(data.t)) if interpolated is None else np.flatnonzero(~interpolated)
     if "qd" in data.estimated or len(known) <= LEAST:
@@ -126,10 +126,10 @@ def _common_slope(t: np.ndarray, parts: Iterable[Counts]) -> float:
 
 
 def _on_one_grid(t: np.ndarray, trajectory: np.ndarray, parts: list[Counts], period: float) -> dict[int, Counts]:
-    """Returns one part per trajectory, with counts from one start, so that they are late as their stamps are.
+    """Returns one part per trajectory, with all counts from one start.
 
-    A run begins so many whole periods after the rows before it that the lateness of neighbouring rows agrees in the
-    mean; over many rows the period is not yet accurate enough.
+    The number of periods between two runs makes the mean lateness of neighbouring rows agree. The period alone is not
+    accurate enough over many rows.
     """
     joined: dict[int, Counts] = {}
     for rows, counts in parts:

@@ -4,30 +4,30 @@ A Butterworth filter runs forwards and backwards (Gustafsson 1996), with the gai
 
     H(f) = 1 / (1 + (f / cutoff)^(2 order))
 
-without a time shift, ½ at the cut-off. It is linear, so it commutes with a model that is linear in its parameters,
-F(Phi theta) = F(Phi) theta: if the torques pass `low_pass`, so must the columns of Phi. Columns of a filtered q are not
-filtered columns if a force has a wider band than the motion, such as dry friction.
+without a time shift; the gain at the cut-off is ½. The filter is linear and commutes with a model that is linear in its
+parameters, F(Phi theta) = F(Phi) theta. If you apply `low_pass` to the torques, apply it to the columns of Phi too.
+Columns of a filtered q are not filtered columns if a force, such as dry friction, has a wider band than the motion.
 
-At the ends the filter knows one side only. It extends the signal by reflection, after subtracting a slow polynomial,
-which makes accelerations there 2 to 40 times more accurate; from 1.5 periods on they are as accurate as elsewhere.
+At the ends the filter sees one side only. It subtracts a slow polynomial and extends the signal by reflection, which
+makes accelerations there 2 to 40 times more accurate. From 1.5 periods on they are as accurate as elsewhere.
 
-Derivatives are those of the quintic spline through the filtered samples. A second derivative is exact to 0.02 % at a
-tenth of the rate and to 1.3 % at a quarter, where central differences taken twice lose 12 % and 60 %.
+A quintic spline through the filtered samples gives the derivatives. A second derivative is exact to 0.02 % at a tenth
+of the rate and to 1.3 % at a quarter; two central differences lose 12 % and 60 % there.
 
-The cut-off minimises the expected error of accelerations. The spectrum of a coordinate is the sum of that of its
-motion, S(f), and a white noise floor N. A filter of gain H removes the fraction 1 - H of the motion's acceleration and
-passes the fraction H of the noise's:
+The cut-off minimises the expected error of accelerations. The spectrum of a coordinate is the sum of the motion's
+spectrum S(f) and a white noise floor N. A filter of gain H removes the fraction 1 - H of the motion's acceleration and
+passes the fraction H of the noise:
 
     E(cutoff) = sum over joints of  integral (2 pi f)^4 [(1 - H)² S + H² N] df  /  integral (2 pi f)^4 S df
 
-For a steep filter the frequency weight does not affect the minimum, which lies where S = N for derivatives of any
-order: one cut-off serves q, qd and qdd. Spectra of second differences are averaged (Welch 1967) and divided by the gain
-of the differences, so that the motion does not leak into the floor.
+For a steep filter the minimum lies where S = N for derivatives of any order, so one cut-off serves q, qd and qdd.
+Spectra of second differences are averaged (Welch 1967) and divided by the gain of the differences, so that the motion
+does not leak into the floor.
 
-Spectra are means of squares, which a single jump can dominate; the noise is a median, which no jump changes. Jumps are
-therefore interpolated before spectra are taken. If the top of a spectrum is flat and above the median's floor, it is
-the floor. Noise need not be white: where the spectrum of accelerations rises up to the highest frequency, it is noise.
-A periodic motion has lines, and only noise in the gaps between them: neither rule ends a motion in a gap.
+A single jump can dominate a spectrum, which is a mean of squares, but not the noise, which is a median. Jumps are
+therefore interpolated before spectra are taken. A flat top of a spectrum above the median's floor is the floor. Noise
+need not be white: a spectrum of accelerations that rises up to the highest frequency is noise. Periodic motions have
+lines with only noise between them, so neither rule ends a motion in a gap.
 """
 
 import math
@@ -44,7 +44,7 @@ ORDER = 4
 PERIODS = 3
 """Length of the reflected extension at both ends of a segment, in periods of the cut-off."""
 END_PERIODS, END_DEGREE = 1.0, 5
-"""Length in periods of the cut-off, and degree, of the polynomial from which values at an end are estimated."""
+"""Length in periods of the cut-off, and degree, of the polynomial that estimates values at an end."""
 SEGMENT = 8.0
 """s: length of the segments over which spectra are averaged."""
 SEEN = 1.5
@@ -55,17 +55,17 @@ TOP = 0.45
 MOVES = 2.0
 """A joint counts as moving if its standard deviation exceeds this multiple of its noise."""
 WORTH = 1e-4
-"""No filter is applied up to this relative error of unfiltered accelerations; above it there always is a cut-off."""
+"""A filter is applied if the relative error of unfiltered accelerations is larger."""
 JUMP = 8.0
 """A jump differs from its neighbours' prediction by more than this many standard deviations."""
 RARE = 0.1
-"""Largest fraction of samples that can be jumps; more of them are a motion, or noise that is not white."""
+"""Largest fraction of samples that can be jumps; a larger one is a motion, or noise that is not white."""
 DEVIATION = np.array([-1, 6, -15, 20, -15, 6, -1]) / 20
 """Weights of seven samples for the deviation of the middle one from the quintic through the others."""
 PREDICTION = math.sqrt(1 + 524 / 400)
 """Standard deviation of the prediction error, in units of the noise."""
 MEDIAN = math.log(2)
-"""Ratio of median to mean of a spectrum's lines if few segments are averaged."""
+"""Ratio of the median of a spectrum's lines to their mean, if few segments are averaged."""
 RISES = 3.0
 """A spectrum of accelerations that exceeds its minimum by this factor at high frequencies is noise there."""
 GAP = 3.3
@@ -94,7 +94,7 @@ class Choice(NamedTuple):
 
 
 def gain(f: Float[np.ndarray, " n"], cutoff: float) -> Float[np.ndarray, " n"]:
-    """H of both passes; 1 for an infinite cut-off."""
+    """Returns the gain H of both passes; 1 for an infinite cut-off."""
     return 1 / (1 + (f / cutoff) ** (2 * ORDER))
 
 
@@ -122,10 +122,10 @@ def low_pass(values: Float[np.ndarray, "N k"], *, rate: float, cutoff: float) ->
 
 
 def _between_ends(values: np.ndarray, near: int) -> np.ndarray:
-    """The quintic with the own value, slope and curvature of values [n, k] at both ends, estimated from `near` samples.
+    """Returns the quintic with the value, slope and curvature of values [n, k] at both ends, from `near` samples each.
 
-    Without it the values are straight at their ends, where the filter extends them by reflection; it is slow enough to
-    pass every filter. Zero for fewer samples than twice `near`.
+    After subtracting it, the values are straight at their ends, where the filter reflects them. The quintic is slow
+    enough to pass every filter. Zero for fewer than twice `near` samples.
     """
     near = max(near, 2 * END_DEGREE)
     if len(values) < 2 * near:
@@ -145,10 +145,10 @@ def _between_ends(values: np.ndarray, near: int) -> np.ndarray:
 def derivatives(
     q: Float[np.ndarray, "n k"], *, rate: float
 ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
-    """qd and qdd of one segment at equal steps, from its quintic spline; `InputError` for fewer than six samples."""
+    """Returns qd and qdd of one segment at equal steps by a quintic spline; `InputError` for fewer than six samples."""
     require_positive(rate=rate)
     if len(q) < 6:
-        raise InputError(f"a segment has {len(q)} samples; its rates take at least 6: record longer motions")
+        raise InputError(f"a segment has {len(q)} samples, but derivatives need at least 6; record longer motions")
     t = np.arange(len(q)) / rate
     curve = spline(t, q, 5)
     return curve(t, nu=1), curve(t, nu=2)
@@ -190,10 +190,10 @@ def choose_cutoff(q: JointSamples, trajectory: SampleIndex, *, rate: float, nois
 
 
 def _without_jumps(values: np.ndarray, trajectory: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Interpolates rare samples of channels [N, k] that neither noise [k] nor the motion explains.
+    """Interpolates jumps: rare samples of channels [N, k] that neither noise [k] nor the motion explains.
 
-    A sample is compared with the prediction of the quintic through three samples on either side. It is a jump if the
-    error is many standard deviations both of the noise and of such errors elsewhere.
+    A quintic through three samples on either side predicts each sample. A jump has an error of many standard deviations
+    of the noise and of the errors elsewhere.
     """
     from scipy.ndimage import correlate1d, maximum_filter1d
 
@@ -212,19 +212,18 @@ def _without_jumps(values: np.ndarray, trajectory: np.ndarray, noise: np.ndarray
 
 
 def _flat_top(f: np.ndarray, spectrum: np.ndarray) -> np.ndarray:
-    """Level [d] of the upper half of a spectrum [F, d] that is flat, as white noise is; zero otherwise."""
+    """Returns the level [d] of the upper half of a spectrum [F, d] if it is flat, like white noise; else zero."""
     levels = [np.median(part, axis=0) for part in np.array_split(spectrum[f > f[-1] / 2], 3)]
     lowest = np.min(levels, axis=0)
     return np.where(np.max(levels, axis=0) < FLAT * lowest, lowest / MEDIAN, 0.0)
 
 
 def _rising(f: np.ndarray, spectrum: np.ndarray, white: np.ndarray) -> np.ndarray:
-    """Part of a spectrum [F, d] above the minimum of the acceleration power, if that rises up to half the rate; else 0.
+    """Returns the noisy part of a spectrum [F, d]: above the minimum of the acceleration power, if it rises from there.
 
-    Forces of finite power make accelerations with a falling spectrum, so a rising one is noise, white or not: timing
-    jitter of a fraction of a step, for example, is noise proportional to the velocity. Zero, too, if the minimum is
-    shallow and the white floor explains the highest frequencies: what lies between is motion, such as that of motors
-    that chatter.
+    Forces of finite power cause a falling spectrum of accelerations, so a rising one is noise, white or not. Timing
+    jitter of a fraction of a step, for example, is noise proportional to the velocity. Zero if the minimum is shallow
+    and the white floor explains the highest frequencies: motion, such as chatter of motors, lies in between.
     """
     logarithm = np.log(np.maximum(spectrum, np.finfo(float).tiny))
     accelerations = f[:, None] ** 4 * np.exp(_mean(logarithm))  # geometric mean
@@ -244,7 +243,7 @@ def _rising(f: np.ndarray, spectrum: np.ndarray, white: np.ndarray) -> np.ndarra
 
 
 def _spectra(values: np.ndarray, trajectory: np.ndarray, *, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Positive frequencies [F], Hz, F >= 7, and power spectra [F, k] of channels [N, k], unit² / Hz, over segments.
+    """Returns positive frequencies [F], Hz, F >= 7, and mean power spectra [F, k] of channels [N, k], unit² / Hz.
 
     Raises:
         InputError: no trajectory has sixteen samples.
@@ -253,7 +252,9 @@ def _spectra(values: np.ndarray, trajectory: np.ndarray, *, rate: float) -> tupl
 
     parts = [part for part in by_trajectory(values, trajectory) if len(part) >= 16]
     if not parts:
-        raise InputError("no segment has the 16 samples of a spectrum; record longer motions, or give a cut-off")
+        raise InputError(
+            "no segment has the 16 samples that a spectrum needs; record longer motions, or give a cut-off"
+        )
     length = min(max(len(part) for part in parts) - 2, max(14, round(SEGMENT * rate)))
     f, powers = np.zeros(0), []
     for part in parts:
@@ -266,19 +267,19 @@ def _spectra(values: np.ndarray, trajectory: np.ndarray, *, rate: float) -> tupl
 
 
 def _mean(spectrum: np.ndarray) -> np.ndarray:
-    """Mean of a spectrum [F, d] over a sixth of an octave on either side, which keeps lines."""
+    """Averages a spectrum [F, d] over a sixth of an octave on either side, which preserves lines."""
     summed = np.pad(np.cumsum(spectrum, axis=0), ((1, 0), (0, 0)))
     low, high = _window(len(spectrum), 2 ** (-1 / 6), 2 ** (1 / 6))
     return (summed[high] - summed[low]) / (high - low)[:, None]
 
 
 def _highest(values: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Maximum over the frequencies from `low` to `high` times each one."""
+    """Returns the maximum over frequencies between `low` and `high` times each frequency."""
     return np.stack([values[a:b].max(axis=0) for a, b in zip(*_window(len(values), low, high), strict=True)])
 
 
 def _window(count: int, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
-    """First and last index + 1 of the frequencies from `low` to `high` times each one."""
+    """Returns the index range of frequencies between `low` and `high` times each frequency."""
     place = np.arange(1, count + 1)
     first = np.maximum(np.floor(place * low).astype(int) - 1, 0)
     return first, np.minimum(np.ceil(place * high).astype(int), count)

@@ -1,14 +1,14 @@
 """Sampling of a log: rate and gaps, equal steps, repeated rows, and the noise and resolution of every channel.
 
-Noise is estimated from differences of neighbouring samples. Differences of order m of white noise of standard deviation
-s have the variance s² C(2m, m), while those of a slow signal vanish as (2 pi f / rate)^m. Their median size is
-insensitive to rare jumps, such as those of dry friction when a joint reverses. The smallest estimate of several orders
-is used, since any remaining signal increases an estimate.
+Noise is estimated from differences of neighbouring samples. Differences of order m of white noise with standard
+deviation s have the variance s² C(2m, m), while differences of a slow signal vanish as (2 pi f / rate)^m. Their median
+size is insensitive to rare jumps, for example from dry friction when a joint reverses. Any remaining signal increases
+an estimate, so the smallest estimate of several orders is used.
 
 A logger that is faster than its source, or that misses a message, writes the last row again. Differences across such a
-row are wrong by a whole step, far more than encoder noise. The step after the repeat tells two cases apart. After a
+row are wrong by a whole step, far more than encoder noise. The step after the repeat distinguishes two cases. After a
 *lost* row the next one is on time, so the joint has moved twice as far as usual. After an *inserted* row it has moved
-the usual distance, because the source is slower than the log's times claim.
+the usual distance, because the source is slower than the times of the log suggest.
 """
 
 import math
@@ -24,29 +24,29 @@ from dln_jax.types import InputError, JointSamples, JointVector, SampleIndex, Sa
 BRIDGED = 3.5
 """Gaps up to this multiple of the median step are interpolated; longer ones cut a trajectory."""
 EVEN = 1e-3
-"""Samples are not resampled up to this relative deviation from equal steps."""
+"""Samples are resampled if they deviate more from equal steps (relative)."""
 DROPPED = ("p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
-"""Arrays of a log that are dropped when it is brought to equal steps."""
+"""Arrays of a log that are dropped by resampling to equal steps."""
 ORDERS = (2, 3, 4, 5, 6)
 NORMAL = 0.67448975
 """Median absolute value of a standard normal variable."""
 SLOW = 5e-3
-"""If differences of a log give a noise above this fraction of the positions' standard deviation, sampling is so slow
-that they are differences of the motion."""
+"""If the estimated noise exceeds this fraction of the positions' standard deviation, sampling is too slow: the
+differences are motion."""
 TINY = 1e-280
-"""Smaller channels count as constant: twelve of their digits cannot be rounded to."""
+"""Smaller channels count as constant, because they do not have twelve digits."""
 LONGEST = 5
-"""Longest run of rows that counts as repeats; a longer standstill is a joint at rest or a gap in the messages."""
+"""Longest run of repeated rows; a longer standstill is a joint at rest or a gap in the messages."""
 COMPARABLE = 0.3
 """The steps before and after a repeat must be at least this fraction of the step that ends it."""
 CLEAR = 3.0
-"""A joint must move on by so many encoder steps that resolution cannot explain equal readings."""
+"""A joint must move by this many encoder steps after a repeat, so that resolution does not explain equal readings."""
 CHANCE = 3.0
 """Equal rows must exceed the number expected by chance, for independent channels, by this factor."""
 NEAR = 5
 """The usual step is computed from this number of steps on either side of a repeat."""
 LOST = 1.5
-"""If the step after a repeat is at least this multiple of the usual one, a row was lost."""
+"""A row was lost if the step after a repeat is at least this multiple of the usual step."""
 
 
 class Timing(NamedTuple):
@@ -55,7 +55,7 @@ class Timing(NamedTuple):
     rate: float
     """Hz, from the median over trajectories of their median steps."""
     jitter: float
-    """Standard deviation of the steps without gaps, relative to the median step; largest over trajectories."""
+    """Standard deviation of the steps without gaps, relative to the median step; the largest of all trajectories."""
     gaps: int
     """Number of steps longer than `GAP` times the median."""
     longest: float
@@ -65,18 +65,18 @@ class Timing(NamedTuple):
 
 
 class Repeats(NamedTuple):
-    """Samples that repeat the one before while the robot moves."""
+    """Samples that repeat the previous one while the robot moves."""
 
     q: Bool[np.ndarray, " N"]
     """All coordinates repeat."""
     tau: Bool[np.ndarray, " N"]
     """All torques repeat."""
     inserted: bool
-    """Whether rows were inserted, so that the times of all later samples are too late."""
+    """Whether rows were inserted, which makes the times of all later samples too late."""
 
     @property
     def rows(self) -> Bool[np.ndarray, " N"]:
-        """Samples whose coordinates and torques both repeat."""
+        """Samples with repeated coordinates and torques."""
         return self.q & self.tau
 
 
@@ -101,14 +101,14 @@ def timing(t: SampleVector, trajectory: SampleIndex) -> Timing:
 
 
 def typical_rate(data: Trajectories) -> float:
-    """Hz, from the median step, without the rounding errors of time differences."""
+    """Returns the rate by the median step, Hz, without the rounding errors of time differences."""
     return float(f"{timing(data.t, data.trajectory).rate:.9g}")
 
 
 def even(
     t: Float[np.ndarray, " n"], values: Float[np.ndarray, "n k"], rate: float
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
-    """One segment at equal steps from its first sample: unchanged if equally spaced, else by a cubic spline."""
+    """Resamples one segment to equal steps by a cubic spline; unchanged if it already has them."""
     # The margins keep the last sample if rounding puts it just below a whole step.
     count = int(np.floor((t[-1] - t[0]) * rate * (1 + 1e-9) + 1e-6)) + 1
     uniform = t[0] + np.arange(count) / rate
@@ -118,17 +118,17 @@ def even(
 
 
 def spline(t: Float[np.ndarray, " n"], values: np.ndarray, degree: int = 3) -> Any:
-    """SciPy's spline through values [n, ..], of a lower degree if there are too few."""
+    """Returns SciPy's spline through values [n, ..], of lower degree if there are too few samples."""
     from scipy.interpolate import make_interp_spline
 
     return make_interp_spline(t, values, k=min(degree, len(t) - 1))
 
 
 def held_at_equal_steps(data: Trajectories, rate: float | None = None) -> Trajectories:
-    """Converts q and commanded torques, which are held from each sample to the next, to equal steps.
+    """Resamples q and commanded torques, which are held from each sample to the next, to equal steps.
 
-    tau becomes the mean over the step that follows each sample: impulses stay exact, where a spline would overshoot.
-    Gaps that are not bridged remain. Rates become NaN, and other arrays are dropped; `smooth` derives rates from q.
+    tau becomes its mean over the step after each sample, which keeps impulses exact; a spline would overshoot. Long
+    gaps remain. Rates become NaN, and other arrays are dropped; `smooth` derives rates from q.
 
     Args:
         data: q, tau and the times of the samples.
@@ -143,7 +143,7 @@ def held_at_equal_steps(data: Trajectories, rate: float | None = None) -> Trajec
         t, q, tau = data.t[piece], data.q[piece], data.tau[piece]
         times, positions = even(t, q, rate)
         if positions is not q:
-            # Values are held to the next sample, the last for ever.
+            # Each value holds until the next sample, the last one forever.
             ends = np.append(t, max(t[-1], times[-1]) + 2 * step)
             integral = BSpline(ends, tau, 0).antiderivative()
             tau = (integral(times + step) - integral(times)) / step
@@ -155,10 +155,10 @@ def held_at_equal_steps(data: Trajectories, rate: float | None = None) -> Trajec
 
 
 def noise_of(values: Float[np.ndarray, "N k"], trajectory: SampleIndex) -> Float[np.ndarray, " k"]:
-    """Standard deviation of the white noise of every channel, in its unit, at least its quantisation noise, step / √12.
+    """Estimates the standard deviation of each channel's white noise; at least the quantisation noise, step / √12.
 
-    Samples are at equal steps except for gaps, which are rare; trajectories of fewer than seven samples are ignored.
-    Zero for a constant channel, infinite if there are no such trajectories.
+    Samples must have equal steps with rare gaps. Trajectories of fewer than seven samples are ignored. Zero for a
+    constant channel, infinite if all trajectories are shorter.
     """
     parts = [part for part in by_trajectory(values, trajectory) if len(part) > max(ORDERS)]
     if not parts:
@@ -172,9 +172,9 @@ def noise_of(values: Float[np.ndarray, "N k"], trajectory: SampleIndex) -> Float
 
 
 def torque_noise(data: Trajectories) -> JointVector | None:
-    """Standard deviation of the white noise of every torque, N m or N; `None` if the sampling is too slow to tell.
+    """Estimates the standard deviation of each torque's white noise, N m or N; `None` if sampling is too slow.
 
-    The noise of the positions, which are measured much better than torques, shows whether it is.
+    Positions are measured much more accurately than torques, so their apparent noise shows whether it is.
     """
     spread = data.q.std(axis=0)
     moving = spread > 0
@@ -184,12 +184,12 @@ def torque_noise(data: Trajectories) -> JointVector | None:
 
 
 def step_of(values: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"]:
-    """Step size of every channel, such as an encoder's resolution; zero for a channel without levels."""
+    """Returns the step size of every channel, such as an encoder's resolution; zero for a channel without levels."""
     return np.array([_step(channel) for channel in values.T])
 
 
 def by_trajectory(values: np.ndarray, trajectory: np.ndarray) -> list[np.ndarray]:
-    """Values of every trajectory; their samples are contiguous."""
+    """Splits values by trajectory."""
     return np.split(values, np.flatnonzero(np.diff(trajectory)) + 1)
 
 
@@ -209,12 +209,12 @@ def _step(channel: np.ndarray) -> float:
 
 
 def delay_held(values: Float[np.ndarray, "N k"], samples: float) -> Float[np.ndarray, "N k"]:
-    """Delays held values by a number of samples, and returns their mean over the step that follows each sample.
+    """Delays held values by a number of samples; returns their mean over the step after each sample.
 
     Values before the first sample are zero.
 
     Args:
-        samples: need not be a whole number.
+        samples: delay in samples, not necessarily whole.
 
     Raises:
         InputError: the delay is negative or not finite.
@@ -231,16 +231,16 @@ def find_repeats(q: JointSamples, tau: JointSamples, trajectory: SampleIndex) ->
     """Finds repeated samples of q and of tau; torques that never vary repeat with q."""
     of_q, after = _repeating(q, trajectory)
     of_tau, _ = _repeating(tau, trajectory)
-    # A torque may be constant by itself, so a repeated row requires repeated coordinates.
+    # Constant torques are common, so a repeated row requires repeated coordinates.
     of_tau |= of_q & np.r_[False, (np.diff(tau, axis=0) == 0).all(axis=1)]
     return Repeats(of_q, of_tau, after < LOST and not (of_q & ~of_tau).any())
 
 
 def without_repeats(data: Trajectories) -> tuple[Trajectories, Repeats]:
-    """The log without its repeats, and the repeats.
+    """Removes repeated rows from a log; returns the log and the repeats.
 
-    Repeated rows are removed. If they were inserted, their time is removed too and the remaining steps are stretched to
-    the same total. If q or tau repeat alone, they are interpolated.
+    If the rows were inserted, their time is removed too and the other steps are stretched to the same total. If only q
+    or only tau repeats, it is interpolated.
     """
     repeats = find_repeats(data.q, data.tau, data.trajectory)
     if not (repeats.q | repeats.tau).any():
@@ -254,10 +254,7 @@ def without_repeats(data: Trajectories) -> tuple[Trajectories, Repeats]:
 
 
 def _repeating(values: np.ndarray, trajectory: np.ndarray) -> tuple[np.ndarray, float]:
-    """Mask of the rows that repeat the one before, and the size of the step after a repeat in usual steps.
-
-    The size is infinite without repeats.
-    """
+    """Returns a mask of repeated rows, and the step after a repeat relative to the usual step (infinite if none)."""
     repeating = np.zeros(len(values), bool)
     changes = np.diff(values, axis=0)
     inside = np.diff(trajectory) == 0
@@ -293,7 +290,7 @@ def _repeating(values: np.ndarray, trajectory: np.ndarray) -> tuple[np.ndarray, 
 
 
 def interpolate(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, wrong: np.ndarray) -> np.ndarray:
-    """Replaces the wrong samples by a cubic spline through the others of their trajectory."""
+    """Replaces wrong samples by a cubic spline through the others of the trajectory."""
     if not wrong.any():
         return values
     values = values.copy()
@@ -305,7 +302,7 @@ def interpolate(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, wrong
 
 
 def _source_times(t: np.ndarray, trajectory: np.ndarray, repeated: np.ndarray) -> np.ndarray:
-    """Times of the rows on the source's clock: a repeat takes no time, and each trajectory keeps its duration."""
+    """Returns times on the source's clock: a repeat takes no time, and each trajectory keeps its duration."""
     t = t.copy()
     for index in np.unique(trajectory[repeated]):
         here = np.flatnonzero(trajectory == index)

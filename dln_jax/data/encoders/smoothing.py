@@ -1,25 +1,25 @@
 """Converts q, t and tau of a log to trajectories with derivatives.
 
-1. Repeated rows are removed (see `sampling`), and stamps of arrival are replaced by the source's times (see `clock`),
-   which is all that measured rates serve for. Long gaps cut a trajectory into parts named LABEL/1, LABEL/2 and so on,
-   short ones are bridged; samples at unequal steps are interpolated to one rate.
+1. Repeated rows are removed (see `sampling`). The source's times replace stamps of arrival (see `clock`), the only use
+   of measured rates. Long gaps cut a trajectory into parts named LABEL/1, LABEL/2 and so on; short ones are bridged.
+   Samples at unequal steps are interpolated to one rate.
 2. The noise of every channel is estimated. The noise and the spectra of q determine the cut-off, unless it is set.
 3. q is filtered without delay; qd and qdd are derivatives of the result. tau is filtered too if samples are dropped,
-   which requires it, or on request.
-4. Ends, where a filter knows one side only, are trimmed, and every k-th sample is kept.
+   or on request.
+4. The ends, where a filter sees one side only, are trimmed, and every k-th sample is kept.
 
-Torques are not filtered by default: least squares average out their noise, while filtered torques of a model with dry
-friction belong to no state, see `filters`. On a simulated seven-axis arm filtering them cost a factor of 1.6
+Torques are not filtered by default. Least squares average out their noise, and filtered dry friction does not match any
+state (see `filters`). On a simulated seven-axis arm, filtering them increased the error by a factor of 1.6
 (`scripts.reports.robots.known_kinematics`).
 
-Short or unevenly sampled motions are smoothed by local polynomials. A polynomial in time is fitted by least squares to
-the neighbours of every sample, at any spacing (Savitzky and Golay 1964). The number of neighbours is chosen per
-coordinate by leave-one-out error, e_i / (1 - H_ii) (Allen 1974): few for a strongly curved motion, many for a noisy
-one. This assumes independent noise.
+`smooth_locally` is for short or unevenly sampled motions. It fits a polynomial in time by least squares to the
+neighbours of every sample, at any spacing (Savitzky and Golay 1964). The leave-one-out error e_i / (1 - H_ii) (Allen
+1974) chooses the number of neighbours per coordinate: few for a strongly curved motion, many for a noisy one. This
+assumes independent noise.
 
 The low-pass filter of `smooth` is for long logs: it needs equal steps and four periods of its cut-off, and is less
-accurate near the ends. On eight segments of 61 samples its velocities had two to five times the error of these, and its
-noise was a quarter too small if steps varied by 30 %.
+accurate near the ends. On eight segments of 61 samples its velocities had two to five times the error of local
+polynomials, and its noise estimate was a quarter too small if steps varied by 30 %.
 """
 
 from collections.abc import Sequence
@@ -38,8 +38,8 @@ from dln_jax.data.splits import segments, select_samples
 from dln_jax.types import InputError, JointVector, require_positive
 
 SHORT = 0.01
-"""s: gaps up to this length are bridged, too, whatever the rate: a cubic spline through motions of 10 Hz is off by 4e-4
-of their size at most."""
+"""s: gaps up to this length are bridged at any rate; the error of a cubic spline through motions of 10 Hz is at most
+4e-4 of their size."""
 SHORTEST = 4.0
 """Shortest segment kept, in periods of the cut-off."""
 TRIMMED = 1.5
@@ -47,11 +47,11 @@ TRIMMED = 1.5
 PART = "/"
 """Separator between a trajectory's label and the number of its part."""
 DEGREE = 4
-"""Degree of the polynomials: high enough for the acceleration itself to have slope and curvature."""
+"""Degree of the polynomials, which gives the acceleration a slope and a curvature."""
 FEWEST = DEGREE + 2
 """Samples of the shortest segment."""
 GROWTH = 1.3
-"""Ratio of successive numbers of neighbours tried."""
+"""Ratio of successive trial numbers of neighbours."""
 MOST_POINTS = 401
 
 
@@ -65,11 +65,11 @@ class Smoothed(NamedTuple):
     rate: float
     """Sampling rate before decimation, Hz."""
     noise_q: JointVector
-    """Standard deviation of every encoder's noise, rad or m."""
+    """Standard deviation of the noise of each encoder, rad or m."""
     noise_tau: JointVector
     """Standard deviation of the noise of every torque of `data`, N m or N; zero without torques."""
     choice: Choice | None
-    """Data behind the choice of the cut-off; `None` if the cut-off was set."""
+    """Reasons for the choice of the cut-off; `None` if it was set."""
     filtered_torque: bool
     decimate: int
     trim: float
@@ -79,7 +79,7 @@ class Smoothed(NamedTuple):
     left_out: int
     """Number of segments that were too short."""
     repeats: Repeats
-    """Repeated samples of the log, which were resampled over."""
+    """Repeated samples of the log, which were interpolated."""
     clock: Clock | None
     """Times of the source, if they replaced the stamps."""
 
@@ -92,7 +92,7 @@ def smooth(
     decimate: int = 1,
     trim: float | None = None,
 ) -> Smoothed:
-    """Estimates derivatives and smooths a log's q, t and tau for learning; existing rates only correct stamps.
+    """Smooths q, t and tau of a log and estimates derivatives; measured rates serve only to correct stamps.
 
     Args:
         cutoff: Hz, infinite for none (default: chosen from the data, see `filters`).
@@ -101,7 +101,7 @@ def smooth(
         trim: time cut off at both ends of every part, s (default: 1.5 periods of the cut-off).
 
     Raises:
-        InputError: settings out of range, a decimation below twice the cut-off, or no segment that is long enough.
+        InputError: settings out of range, a decimated rate below twice the cut-off, or too short segments.
     """
     require_positive(decimate=decimate)
     if trim is not None and not trim >= 0:
@@ -173,7 +173,7 @@ def smooth(
 
 
 def _labels(data: Trajectories, sources: list[int]) -> np.ndarray:
-    """Labels of parts by the trajectories that they come from; parts of one trajectory are numbered from 1."""
+    """Labels parts by their trajectories, with numbers from 1 if a trajectory was cut."""
     labels = []
     for place, source in enumerate(sources):
         number = f"{PART}{sources[: place + 1].count(source)}" if sources.count(source) > 1 else ""
@@ -182,19 +182,19 @@ def _labels(data: Trajectories, sources: list[int]) -> np.ndarray:
 
 
 def labels_of_parts(data: Trajectories, labels: Sequence[str]) -> list[str]:
-    """Labels after smoothing: the label of a trajectory that was cut becomes those of its parts; others stay."""
+    """Replaces the label of each cut trajectory by the labels of its parts."""
     parts = {label: [part for part in data.label if part.rpartition(PART)[0] == label] for label in labels}
     return [part for label in labels for part in ([label] if label in data.label else parts[label] or [label])]
 
 
 class LocalRates(NamedTuple):
-    """Trajectories with q, qd and qdd from local polynomials; all else is unchanged."""
+    """Trajectories with q, qd and qdd from local polynomials; other arrays are unchanged."""
 
     data: Trajectories
     noise: JointVector
     """Standard deviation of the noise of q, rad or m."""
     resolved: Bool[np.ndarray, " d"]
-    """Whether more than the fewest neighbours were best; if not, the noise may be the curvature of a coarse motion."""
+    """Whether more than the fewest neighbours were best; otherwise the noise may be curvature of a coarse motion."""
     rows: np.ndarray
     """Rows of the samples kept."""
 
@@ -227,9 +227,9 @@ def smooth_locally(data: Trajectories) -> LocalRates:
 
 
 def _polynomials(t: np.ndarray, q: np.ndarray, size: int) -> Float[np.ndarray, "5 n d"]:
-    """q, qd, qdd, leave-one-out errors and variances of the noise of one segment, from `size` neighbours each.
+    """Returns q, qd, qdd, leave-one-out errors and noise variances of one segment, from `size` neighbours each.
 
-    Near the ends fewer of them are on one side.
+    Near the ends, fewer neighbours are on one side.
     """
     first = np.clip(np.arange(len(t)) - size // 2, 0, len(t) - size)
     around = first[:, None] + np.arange(size)

@@ -5,9 +5,9 @@ The unknowns are the joints' Fourier coefficients. The criterion is a function o
     information    log det A: the product of all parameters' errors, independent of units (D-optimal)
     condition      largest over smallest singular value of the regressor with columns of unit length
 
-Every limit at every sample is an inequality constraint of an augmented Lagrangian. Both criteria have many local
-minima, so several random starts are optimised. A motion is checked at ten times as many samples as it is designed at,
-and keeps a margin for the times between; one that exceeds a limit is designed again with a larger margin or shrunk.
+Each limit at each sample is an inequality constraint of an augmented Lagrangian. Both criteria have many local minima,
+so several random starts are optimised. The check of a motion uses ten times as many samples as its design, with a
+margin for the times between. A motion that exceeds a limit is designed again with a larger margin, or shrunk.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,22 +37,22 @@ from dln_jax.types import InputError, Needs, Scalar, require_positive, require_s
 SHARPNESS = 4
 """Exponent of the power means that approximate the largest and the smallest eigenvalue."""
 FIRST_MARGIN, TIGHTENINGS = 0.01, 3
-"""Initial margin to the limits, relative to them, for excursions between samples; and the number of designs, with a
-larger margin after each that exceeds the limits."""
+"""Initial relative margin to the limits for excursions between samples, and the largest number of designs; a design
+that exceeds the limits increases the margin."""
 FINER = 10
 """Refinement of the time grid for checking motions."""
 MARGIN = 1e-3
-"""Margin kept to every limit at the checked samples (relative; m for clearances) to cover the times between them."""
+"""Margin to each limit at the checked samples (relative; m for clearances), for the times between them."""
 DRAWS = 50
-"""Drawing stops after this number of failed draws per motion found."""
+"""Largest number of failed draws per successful motion."""
 SMALLEST, BISECTIONS = 0.05, 8
-"""Smallest amplitude of a shrunk motion, relative to the original, and the number of bisection steps."""
+"""Smallest amplitude of a shrunk motion relative to the original, and the number of bisection steps."""
 Criterion = Callable[[Array], Array]
 """A [B, B] -> scalar to minimise."""
 
 
 class Design(NamedTuple):
-    """A motion within the limits, and how informative it is."""
+    """A motion within the limits, with its information."""
 
     motion: FourierMotion
     information: Float[np.ndarray, "B B"]
@@ -64,7 +64,7 @@ class Design(NamedTuple):
 
     @property
     def condition(self) -> float:
-        """Condition of the regressor of base parameters with columns of unit length."""
+        """Condition number of the base regressor with columns of unit length."""
         return together([self])[0]
 
     @property
@@ -74,22 +74,22 @@ class Design(NamedTuple):
 
 
 def functions_at(task: Task, finer: int = 1) -> list[np.ndarray]:
-    """Harmonic functions and their first two derivatives, [N, 2 H] each, on the design grid refined by a factor."""
+    """Returns harmonic functions and their first two derivatives, [N, 2 H] each, on the refined design grid."""
     t = task.period * np.arange(finer * task.steps) / (finer * task.steps)
     return [*map(np.asarray, harmonic_functions(task.harmonics, task.period, t))]
 
 
 def furthest(task: Task, motion: FourierMotion) -> tuple[float, str]:
-    """The largest excess on the fine grid, and the name of that limit."""
+    """Returns the largest excess on the fine grid, and the name of that limit."""
     motions = states(functions_at(task, FINER), motion.offset, motion.coefficients)
     parts = zip(*(np.split(np.asarray(array), FINER) for array in motions), strict=True)
     return max(worst(task.samples(*part)[2]) for part in parts)
 
 
 def shrink_to_limits(task: Task, motion: FourierMotion) -> tuple[Design | None, str]:
-    """Shrinks a motion towards its mean posture until it keeps the limits; `None` if even the smallest breaks them.
+    """Shrinks a motion towards its mean posture until it keeps the limits; `None` if the smallest one breaks them.
 
-    The second result is the limit broken at the smallest amplitude, as text.
+    The second result is the broken limit at the smallest amplitude, as text.
     """
 
     def shrunk(amplitude: float) -> FourierMotion:
@@ -112,7 +112,7 @@ def shrink_to_limits(task: Task, motion: FourierMotion) -> tuple[Design | None, 
 
 
 def average_information(task: Task, Phi: Any) -> Any:
-    """A of the regressors [N, d, P] of a motion on the design grid."""
+    """Returns A for the regressors [N, d, P] of a motion on the design grid."""
     W = (Phi[..., task.columns] / task.noise[:, None]).reshape(-1, task.columns.size)
     return W.T @ W / task.steps
 
@@ -125,10 +125,10 @@ def assess(task: Task, motion: FourierMotion) -> Design:
 
 
 def random_designs(task: Task, count: int, *, seed: int = 0) -> list[Design]:
-    """Draws random motions, with every joint scaled to its limits and the whole motion to those of force and clearance.
+    """Draws random motions, scaled per joint to its limits, and as a whole to the limits of force and clearance.
 
     Raises:
-        InputError: too few draws are within the limits (50 failures per motion found); the message names the limit.
+        InputError: too few draws are within the limits (50 failures per success); the message names the limit.
     """
     require_positive(count=count)
     require_seed(seed)
@@ -152,29 +152,29 @@ def random_designs(task: Task, count: int, *, seed: int = 0) -> list[Design]:
             designs.append(design)
         elif (failed := failed + 1) >= DRAWS * max(1, len(designs)):
             raise InputError(
-                f"{failed} random motions broke the limits even when small, the last of {broken}; widen it"
+                f"{failed} random motions broke the limits even when small, the last one {broken}; widen that limit"
             )
     return designs
 
 
 Designer = Callable[..., Design]
-"""(starts, designs whose information is already available) -> the best design within the limits."""
+"""(starts, earlier designs that add information) -> best design within the limits."""
 
 
 def _scaled(A: Float[Array, "B B"]) -> tuple[Float[Array, "B B"], Float[Array, " B"]]:
-    """A scaled to a unit diagonal, and the square roots of its diagonal."""
+    """Returns A scaled to a unit diagonal, and the square roots of its diagonal."""
     lengths = jnp.sqrt(jnp.diagonal(A))
     return A / lengths[:, None] / lengths, lengths
 
 
 def information(A: Float[Array, "B B"]) -> Scalar:
-    """-log det A / 2 B: the mean logarithm of the standard errors along uncorrelated axes."""
+    """Returns -log det A / 2 B, the mean logarithm of the standard errors along uncorrelated axes."""
     scaled, lengths = _scaled(A)
     return -(0.5 * jnp.linalg.slogdet(scaled)[1] + jnp.sum(jnp.log(lengths))) / A.shape[0]
 
 
 def condition(A: Float[Array, "B B"]) -> Scalar:
-    """Logarithm of the regressor's condition with unit-length columns; smooth means replace extreme eigenvalues."""
+    """Returns the log condition of the regressor with unit-length columns; smooth means replace extreme eigenvalues."""
     sizes = jnp.log(jnp.maximum(jnp.linalg.eigvalsh(_scaled(A)[0]), jnp.finfo(A.dtype).eps))
     largest, smallest = (jax.nn.logsumexp(sign * SHARPNESS * sizes) / SHARPNESS for sign in (1, -1))
     return 0.5 * (largest + smallest)
@@ -184,18 +184,19 @@ CRITERIA: dict[str, Criterion] = {"information": information, "condition": condi
 
 
 def make_designer(task: Task, criterion: Criterion, *, rounds: int = 8, iterations: int = 60) -> Designer:
-    """Makes a function that optimises starts and returns the best design, the starts included; it compiles once.
+    """Makes a function that optimises starts and returns the best design including the starts; it compiles once.
 
     Args:
+        task: model and constraints, from `make_task`.
         criterion: function of the information, such as one of `CRITERIA`.
-        rounds: upper limit of rounds of the augmented Lagrangian.
+        rounds: largest number of rounds of the augmented Lagrangian.
         iterations: L-BFGS iterations per round.
     """
     functions, basis = functions_at(task), rest_basis(task.harmonics)
     middle, half = task.limits.position.mean(axis=1), np.diff(task.limits.position, axis=1)[:, 0] / 2
 
     def series(x: Any) -> tuple[Any, Any]:
-        """Offset and coefficients of dimensionless unknowns."""
+        """Converts dimensionless unknowns to offset and coefficients."""
         unknowns = x.reshape(len(half), -1)
         return middle + half * unknowns[:, 0], half[:, None] * (unknowns[:, 1:] @ basis.T)
 
@@ -242,12 +243,14 @@ def design_set(
     criterion: str = "information",
     say: Callable[[int, str], None] = lambda done, text: None,
 ) -> tuple[list[Design], Design]:
-    """Designs motions for identification, each complementing those before it, and a separate one for validation.
+    """Designs motions for identification, each complementing the previous ones, and a separate one for validation.
 
     Args:
-        drawn: starts such as `random_designs`, divided equally among the motions.
+        task: model and constraints, from `make_task`.
+        drawn: starts, for example from `random_designs`, divided equally among the motions.
+        trajectories: number of motions for identification.
         criterion: a name in `CRITERIA`.
-        say: called with the number of finished motions and the last result as text.
+        say: takes the number of finished motions and the last result as text.
 
     Raises:
         InputError: an unknown criterion, no trajectories, or fewer starts than motions.
@@ -257,7 +260,9 @@ def design_set(
     require_positive(trajectories=trajectories)
     starts = len(drawn) // (trajectories + 1)
     if not starts:
-        raise InputError(f"{len(drawn)} starts are fewer than the {trajectories + 1} motions; expected one for each")
+        raise InputError(
+            f"{len(drawn)} starts are too few for {trajectories + 1} motions; expected at least one per motion"
+        )
     best = make_designer(task, CRITERIA[criterion])
     designs: list[Design] = []
     for place in range(trajectories + 1):
@@ -268,7 +273,7 @@ def design_set(
 
 
 def together(designs: Sequence[Design]) -> tuple[float, float]:
-    """Condition and log det A of several motions of equal length taken together."""
+    """Returns condition number and log det A of several motions of equal length together."""
     scaled, lengths = map(np.asarray, _scaled(jnp.asarray(np.mean([design.information for design in designs], axis=0))))
     sizes = np.linalg.eigvalsh(np.nan_to_num(scaled))
     if not sizes[0] > 0:
@@ -277,7 +282,7 @@ def together(designs: Sequence[Design]) -> tuple[float, float]:
 
 
 def error_ratio(designs: Sequence[Design], others: Sequence[Design]) -> float:
-    """Geometric mean over parameters of the standard errors from `designs` over those from `others`, equally many."""
+    """Returns the geometric mean over parameters of the standard errors from `designs` relative to as many `others`."""
     count = designs[0].information.shape[0]
     return float(np.exp((together(others)[1] - together(designs)[1]) / (2 * count)))
 

@@ -1,6 +1,6 @@
-"""Limits of a motion, and how far a state exceeds them.
+"""Limits of a motion, and the excess of a state over them.
 
-The excess of a limit is relative to its size and at most zero while the limit is kept:
+The excess is relative to the limit, and at most zero inside the limit:
 
     |x - middle| / half - 1   for positions, velocities, accelerations and forces,   -clearance / 1 m
 """
@@ -20,9 +20,9 @@ from dln_jax.mechanics.trees.frames import world_frames
 from dln_jax.types import InputError, JointVector
 
 SECONDS_TO_SPEED = 0.2
-"""s: assumed time to full velocity if no acceleration limit is stated."""
+"""s: assumed time to full velocity without an acceleration limit."""
 Clearance = Callable[[Array], Array]
-"""q -> [K], m, that must stay positive, such as heights of the links above a table."""
+"""q -> clearances [K], m, that must stay positive, such as heights of the links above a table."""
 
 
 class MotionLimits(NamedTuple):
@@ -39,7 +39,7 @@ class MotionLimits(NamedTuple):
 
 
 class Excess(NamedTuple):
-    """Excess of one state over each limit, relative to it; negative inside, `None` without such a limit."""
+    """Excess of one state over each limit, relative to the limit; negative inside, `None` without a limit."""
 
     position: Any
     """[d]."""
@@ -79,22 +79,22 @@ def limits_of_robot(
     force: Any = None,
     allow_unlimited: Sequence[str] = (),
 ) -> tuple[MotionLimits, list[str]]:
-    """Limits of a robot, from its file and the arguments (which take precedence), and the assumptions made, as text.
+    """Returns a robot's limits from its file and the arguments (which take precedence), and the assumptions as text.
 
-    A revolute joint that may be unlimited gets a range of pi to either side and free force. Accelerations default to
-    reaching full velocity in `SECONDS_TO_SPEED`. Velocity limits are never assumed.
+    A revolute joint that may be unlimited gets a range of pi to either side and any force. The default acceleration
+    limit reaches full velocity in `SECONDS_TO_SPEED`. Velocity limits are never assumed.
 
     Args:
         robot: from `read_robot`.
-        position: half the range, about zero, rad or m; this and the following are one number for all joints, or [d].
+        position: half the range about zero, rad or m; this and the following are one number for all joints, or [d].
         velocity: 1/s or m/s.
         acceleration: 1/s² or m/s².
         force: N m or N, in either direction.
-        allow_unlimited: names (with * and ?) of joints that may lack limits of position (revolute ones) and force.
+        allow_unlimited: names (with * and ?) of joints that may lack limits of force and, if revolute, of position.
 
     Raises:
-        InputError: a joint that is not in `allow_unlimited` lacks a limit, a limit of velocity or of a prismatic
-            joint's position is missing, a pattern matches no joint, or an argument has the wrong number of limits.
+        InputError: a joint outside `allow_unlimited` lacks a limit, a velocity limit or a prismatic position limit is
+            missing, a pattern matches no joint, or an argument has the wrong number of limits.
     """
     tree, d, assumed = robot.tree, robot.tree.degrees_of_freedom, []
     names = tree.names or tuple(map(str, range(d)))
@@ -105,12 +105,12 @@ def limits_of_robot(
         if limit is None:
             continue
         if np.size(limit) not in (1, d):
-            raise InputError(f"{kind} has {np.size(limit)} numbers; expected one, or one for each of the {d} joints")
+            raise InputError(f"{kind} has {np.size(limit)} numbers; expected one, or {d}, one per joint")
         sizes = np.broadcast_to(np.ravel(limit), d)
         limits[kind] = sizes if kind in rates else np.stack([-sizes, sizes], axis=1)
     for pattern in allow_unlimited:
         if not fnmatch.filter(names, pattern):
-            raise InputError(f"there is no joint '{pattern}' to allow without limits; it has {', '.join(names)}")
+            raise InputError(f"no joint matches '{pattern}' of --allow-unlimited; the robot has {', '.join(names)}")
     allowed = np.array([any(fnmatch.fnmatchcase(name, pattern) for pattern in allow_unlimited) for name in names])
     if limits["acceleration"] is None:
         limits["acceleration"] = limits["velocity"] / SECONDS_TO_SPEED
@@ -124,8 +124,8 @@ def limits_of_robot(
         if (refused := absent & ~allowed).any():
             name = names[int(np.argmax(refused))]
             raise InputError(
-                f"joint '{name}' has no limit of {kind}: state it ({option}, or in the file), or give "
-                f"--allow-unlimited {name} if it may go anywhere and take any torque"
+                f"joint '{name}' has no limit of {kind}: state it ({option}, or in the file), or pass "
+                f"--allow-unlimited {name} if any position and torque is safe"
             )
         if absent.any():
             listed = "any joint" if absent.all() else ", ".join(np.array(names)[absent])
@@ -138,27 +138,27 @@ def limits_of_robot(
 
 
 def heights_above(tree: Tree, height: float) -> Clearance | None:
-    """Heights above the plane z = height (m) of all link origins that can move vertically; `None` if none can."""
+    """Returns heights of moving link origins above the plane z = height (m); `None` if none moves vertically."""
     postures = np.random.default_rng(0).uniform(-1, 1, (20, tree.degrees_of_freedom))
     rising = np.ptp([world_frames(tree, jnp.asarray(q))[1][:, 2] for q in postures], axis=0) > 1e-9
     return (lambda q: world_frames(tree, q)[1][rising, 2] - height) if rising.any() else None
 
 
 def scale_limits(limits: MotionLimits, share: float) -> MotionLimits:
-    """Limits reduced to a share in (0, 1], else `InputError`; ranges shrink towards their middles."""
+    """Reduces limits to a fraction in (0, 1] (else `InputError`); ranges shrink towards their middles."""
     if not 0 < share <= 1:
-        raise InputError(f"share is {share}; expected a number in (0, 1], of the limits that may be used")
+        raise InputError(f"share is {share}; expected the usable fraction of the limits, in (0, 1]")
     middle = limits.position.mean(axis=1, keepdims=True)
     position = middle + share * (limits.position - middle)
     return MotionLimits(position, share * limits.velocity, share * limits.acceleration, share * limits.force)
 
 
 def beyond(bounds: np.ndarray, x: Array) -> Array:
-    """Excess of numbers over bounds [n, 2], relative to half the range."""
+    """Returns the excess of numbers over bounds [n, 2], relative to half the range."""
     middle, half = bounds.mean(axis=1), np.diff(bounds, axis=1)[:, 0] / 2
     return jnp.abs(x - middle) / half - 1
 
 
 def worst(excess: Excess) -> tuple[float, str]:
-    """The largest excess over all samples, and its limit; fields as of `excess`, with sample axes in front."""
+    """Returns the largest excess over all samples, and its limit; the fields of `excess` have leading sample axes."""
     return max((float(np.max(values)), kind) for kind, values in excess._asdict().items() if values is not None)

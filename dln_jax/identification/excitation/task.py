@@ -1,7 +1,7 @@
-"""Excitation task: the information that a motion gives on a model's parameters, and the robot's limits.
+"""Excitation task: the information in a motion about a model's parameters, and the robot's limits.
 
-Phi is the derivative of the model's force in its parameters, restricted to independent columns ("base parameters").
-Rows are weighted by the noise of their joint. The mean information of one sample is
+Phi is the derivative of the model's force with respect to its parameters, restricted to independent columns ("base
+parameters"). The noise of each joint weights its row. The mean information of one sample is
 
     A = 1 / N sum over samples of Phiᵀ diag(1 / noise²) Phi,   so that least squares has the covariance A⁻¹ / N
 
@@ -11,7 +11,7 @@ Motions are finite Fourier series of one period, from rest to rest,
 
 after Swevers, Ganseman, Tukel, De Schutter and Van Brussel (1997, IEEE T-RA 13, "Optimal robot excitation and
 identification"). Rates are exact, the spectrum is known, and a motion can be repeated indefinitely. Velocity and
-acceleration vanish at both ends if sum k s_k = 0 and sum k² c_k = 0, whose solutions `rest_basis` spans.
+acceleration vanish at both ends if sum k s_k = 0 and sum k² c_k = 0; `rest_basis` spans the solutions.
 """
 
 from collections.abc import Callable
@@ -33,12 +33,12 @@ from dln_jax.solvers.least_squares import scaled_columns
 from dln_jax.types import InputError, JointVector, require_positive, require_seed
 
 MOST_HARMONICS = 50
-"""Upper limit of harmonics for a design: more give no smooth motion and take hours."""
+"""Largest number of harmonics in a design; more take hours and make rough motions."""
 SAMPLES = 20
 """Samples per shortest period on the design grid."""
 DEPENDENT = 1e-2
-"""The design ignores columns whose residual after projection on the others is below this fraction of the largest:
-right angles that a file writes as 1.57 leave 8e-4."""
+"""The design ignores columns with a residual, after projection on the others, below this fraction of the largest: a
+right angle written as 1.57 leaves 8e-4."""
 STATES = 300
 """Number of random states for finding the independent columns."""
 
@@ -60,19 +60,19 @@ class FourierMotion(NamedTuple):
 
 
 def sample(motion: FourierMotion, t: Any) -> tuple[Float[Array, "N d"], Float[Array, "N d"], Float[Array, "N d"]]:
-    """q, qd and qdd at the times t [N], s."""
+    """Returns q, qd and qdd at the times t [N], s."""
     functions = harmonic_functions(motion.harmonics, motion.period, t)
     return states(functions, motion.offset, motion.coefficients)
 
 
 def states(functions: Any, offset: Any, coefficients: Any) -> tuple[Any, Any, Any]:
-    """q, qd, qdd [N, d] of a series with these coefficients, from `harmonic_functions`."""
+    """Returns q, qd, qdd [N, d] of a series with these coefficients; functions from `harmonic_functions`."""
     q, qd, qdd = (values @ jnp.asarray(coefficients).T for values in functions)
     return offset + q, qd, qdd
 
 
 def harmonic_functions(harmonics: int, period: float, t: Any) -> tuple[Array, Array, Array]:
-    """sin(k w t) for k = 1..H, then cos(k w t), and their first and second derivatives; [N, 2 H] each."""
+    """Returns sin(k w t) for k = 1..H, then cos(k w t), and their first and second derivatives; [N, 2 H] each."""
     rates = 2 * np.pi / period * np.arange(1, harmonics + 1)
     phases = rates * jnp.asarray(t)[:, None]
     sines, cosines = jnp.sin(phases), jnp.cos(phases)
@@ -82,10 +82,10 @@ def harmonic_functions(harmonics: int, period: float, t: Any) -> tuple[Array, Ar
 
 
 def rest_basis(harmonics: int) -> Float[np.ndarray, "F K"]:
-    """Orthonormal columns [2 H, 2 H - 2] that span the coefficients of a joint at rest at both ends.
+    """Returns orthonormal columns [2 H, 2 H - 2] that span the coefficients of a joint at rest at both ends.
 
     Raises:
-        InputError: fewer than two harmonics, which cannot move from rest to rest, or more than `MOST_HARMONICS`.
+        InputError: more than `MOST_HARMONICS`, or fewer than two, which cannot move from rest to rest.
     """
     if not 2 <= harmonics <= MOST_HARMONICS:
         raise InputError(
@@ -103,8 +103,8 @@ def require_sampling(*, period: float, harmonics: int, rate: float) -> None:
     highest = harmonics / period
     if highest >= rate / 2:
         raise InputError(
-            f"{harmonics} harmonics of {period:g} s reach {highest:g} Hz, beyond half the sampling rate of {rate:g} "
-            "Hz; take fewer harmonics, more seconds or a higher rate"
+            f"{harmonics} harmonics of {period:g} s reach {highest:g} Hz, above half the sampling rate of {rate:g} "
+            "Hz; use fewer harmonics, more seconds or a higher rate"
         )
 
 
@@ -114,11 +114,11 @@ class Task(NamedTuple):
     observe: Callable[..., tuple[Array, Array, Excess]]
     """(q, qd, qdd) -> Phi [d, P], tau [d] and the excess over the limits, for one state; differentiable."""
     samples: Callable[..., tuple[Array, Array, Excess]]
-    """The same for `steps` states at once, compiled."""
+    """The compiled `observe` for `steps` states at once."""
     steps: int
     """N, samples of one period on the design grid."""
     columns: Int[np.ndarray, " B"]
-    """Indices of the base parameters among all parameters of the model."""
+    """Indices of the base parameters among the model's parameters."""
     noise: JointVector
     limits: MotionLimits
     period: float
@@ -137,17 +137,19 @@ def make_task(
     noise: Any = 1.0,
     seed: int = 0,
 ) -> Task:
-    """Makes a task for a model whose force is linear in its parameters, such as `models.trees.make_rigid_tree`.
+    """Makes a task for a model that is linear in its parameters, such as `models.trees.make_rigid_tree`.
 
-    Smooth any friction that has a step at rest, on a scale of velocities that motions pass slowly.
+    Smooth any friction with a step at rest, on a velocity scale that motions pass slowly.
 
     Args:
-        parameters: nominal parameters, which give the forces to compare with their limits.
+        model: the model to identify.
+        parameters: nominal parameters, which predict the forces for the force limits.
+        limits: limits of the robot.
         period: period of the motions, s.
         harmonics: harmonics of the series, at least 2.
-        clearance: q -> [K], m, that must stay positive.
-        noise: standard deviation of the measured force of each joint [d], or one for all; only ratios matter.
-        seed: seed of the random states that determine the base parameters.
+        clearance: q -> clearances [K], m, that must stay positive.
+        noise: standard deviation of the measured force of each joint [d], or one number; only ratios matter.
+        seed: seed for the random states that determine the base parameters.
 
     Raises:
         InputError: missing limits, a setting out of range, or no identifiable parameter.
@@ -161,7 +163,7 @@ def make_task(
     rest_basis(harmonics)
     deviation = np.broadcast_to(np.asarray(noise, float), (d,))
     if not (deviation > 0).all():
-        raise InputError(f"noise is {noise}; expected positive numbers, one for each of the {d} joints or for all")
+        raise InputError(f"noise is {noise}; expected one positive number, or {d}, one per joint")
     regressor, theta = linear_force(model, parameters)
     bounded = np.isfinite(limits.force).all(axis=1)
 
@@ -185,15 +187,16 @@ def make_task(
         seen.append(np.asarray(samples(q, qd, qdd)[0]).reshape(steps * d, -1))
     columns = independent_columns(np.concatenate(seen))
     if not columns.size:
-        raise InputError("no parameter of the model shows in its force; expected some that do")
+        raise InputError("the model's force does not depend on its parameters; check the model")
     return Task(observe, samples, steps, columns, deviation, limits, float(period), harmonics)
 
 
 def linear_force(model: Model, parameters: Parameters) -> tuple[Callable[..., Array], Float[np.ndarray, " P"]]:
-    """(q, qd, qdd) -> Phi [d, P], and theta, with tau = Phi theta.
+    """Returns (q, qd, qdd) -> Phi [d, P], and theta, with tau = Phi theta.
 
-    The gradient of a function of Phi in the state equals that of d forces whose parameters are the function's gradients
-    in the rows of Phi. This custom rule makes the program a third as large as derivatives of derivatives.
+    The gradient of a function of Phi with respect to the state is the gradient of d forces, with the function's
+    gradients with respect to the rows of Phi as parameters. This custom rule makes the program a third as large as
+    nested derivatives.
     """
     theta, unravel = ravel_pytree(parameters)
 
@@ -218,7 +221,7 @@ def linear_force(model: Model, parameters: Parameters) -> tuple[Callable[..., Ar
 
 
 def independent_columns(A: Float[np.ndarray, "N P"]) -> Int[np.ndarray, " B"]:
-    """Sorted indices of independent columns that span all others, by QR with pivoting of unit-length columns."""
+    """Returns sorted indices of independent columns that span all others, by pivoted QR of unit-length columns."""
     scaled, _ = scaled_columns(A, NEGLIGIBLE)
     if not scaled.any():
         return np.zeros(0, int)

@@ -1,4 +1,4 @@
-"""What a fit needs of the run that it belongs to, and how it stores a training so that it can continue."""
+"""Context of a fit within its run, and checkpoints for resuming a training."""
 
 import hashlib
 import math
@@ -22,9 +22,9 @@ from dln_jax.zoo import parameter_files as checkpoints
 
 Number = float | None
 Row = tuple[int | list[int], *[Number | list[Number]] * 3, float, str]  # type: ignore[valid-type]
-"""Stored `Progress`, with `null` for NaN and lists if several seeds trained together."""
+"""A stored `Progress`: `null` for NaN, and lists if several seeds trained together."""
 CHECKPOINT = "checkpoint"
-"""Name of the pair of checkpoint files in a run's folder."""
+"""Stem of the two checkpoint files in a run folder."""
 
 
 class Checkpoint(NamedTuple):
@@ -33,7 +33,7 @@ class Checkpoint(NamedTuple):
     directory: Path
     """An existing folder."""
     identity: dict[str, Any]
-    """JSON values that decide the result: `settings` and `data`. A run with other values is not continued."""
+    """JSON values that affect the result: `settings` and `data`. A run with other values is not resumed."""
     resume: bool = False
     """Continue from the stored run, if there is one."""
     name: str = CHECKPOINT
@@ -41,55 +41,55 @@ class Checkpoint(NamedTuple):
 
 @contextmanager
 def no_progress(total: int) -> Iterator[Callable[[int, str], None]]:
-    """Yields a `show(done, text)` that shows nothing."""
+    """Yields a silent `show(done, text)`."""
     yield lambda done, text: None
 
 
 class Context(NamedTuple):
-    """The run of a fit; by default none: nothing is printed or stored."""
+    """Context of a fit within its run; by default nothing is printed or stored."""
 
     seed: int = 0
-    """Seed of parameters and shuffling."""
+    """Seed for parameters and shuffling."""
     until: float = math.inf
     """Reading of `time.perf_counter` at which a fit stops."""
     say: Callable[[str], None] = lambda line: None
     """Takes lines for the user."""
     progress: Callable[[int], AbstractContextManager[Callable[[int, str], None]]] = no_progress
-    """Total -> context of `show(done, text)`."""
+    """Total number of steps -> context of `show(done, text)`."""
     folder: Path | None = None
     """Folder of checkpoints and candidates."""
     resume: bool = False
-    """Continue from what the folder holds."""
+    """Continue from the checkpoints in the folder."""
     mesh: Mesh | None = None
     """Devices that share a fit."""
 
     @property
     def seconds(self) -> float:
-        """Seconds left for fits."""
+        """Seconds left for the fit."""
         return seconds_left(self.until)
 
     def within(self, seconds: float) -> "Context":
-        """The context of a fit that has at most these seconds."""
+        """Returns the context of a fit with this time limit."""
         return self._replace(until=min(self.until, time.perf_counter() + seconds))
 
     def checkpoint(
         self, name: str, optimiser: Optimiser, arrays: Iterable[np.ndarray | Array | None], **settings: Any
     ) -> Checkpoint | None:
-        """Where a training with this identity is stored; `None` without a folder."""
+        """Returns the checkpoint of a training with this identity; `None` without a folder."""
         if self.folder is None:
             return None
         return Checkpoint(self.folder, identity(optimiser, arrays, **settings), self.resume, name)
 
 
 def identity(optimiser: Optimiser, arrays: Iterable[np.ndarray | Array | None], **settings: Any) -> dict[str, Any]:
-    """Returns the identity of a run: optimiser, settings and the SHA-256 of its arrays; a time limit may grow."""
+    """Returns the identity of a run: optimiser, settings and the SHA-256 of its arrays, but no time limit."""
     stated = {"optimiser": type(optimiser).__name__, **optimiser._asdict(), **settings}
     data = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays if array is not None)
     return {"settings": stated, "data": hashlib.sha256(data).hexdigest()}
 
 
 def store(checkpoint: Checkpoint, state: Any, history: list[Progress]) -> None:
-    """Writes the state of a run and its history so far."""
+    """Writes the state and history of a run."""
     facts = {
         **checkpoint.identity,
         "history": finite([[np.asarray(value).tolist() for value in row] for row in history]),
@@ -99,7 +99,7 @@ def store(checkpoint: Checkpoint, state: Any, history: list[Progress]) -> None:
 
 
 def restore(checkpoint: Checkpoint | None, like: Any) -> tuple[Any, list[Progress]] | None:
-    """Returns the stored state and history, or `None` if the run has to start from the beginning.
+    """Returns the stored state and history, or `None` to start from the beginning.
 
     Raises:
         InputError: the stored run had other settings or data, or its files are damaged.
@@ -107,11 +107,9 @@ def restore(checkpoint: Checkpoint | None, like: Any) -> tuple[Any, list[Progres
     if checkpoint is None or not checkpoint.resume or not has_checkpoint(checkpoint.directory, checkpoint.name):
         return None
     manifest = checkpoints.load_manifest(checkpoint.directory, checkpoint.name)
-    for key, remedy in (("data", "give the data and test labels"), ("settings", "give the settings")):
+    for key, remedy in (("data", "use the data and test labels"), ("settings", "use the settings")):
         if manifest.get(key) != finite(checkpoint.identity.get(key)):
-            raise InputError(
-                f"{checkpoint.directory}: the run was started with other {key}; {remedy} it was started with"
-            )
+            raise InputError(f"{checkpoint.directory}: the run was started with other {key}; {remedy} of its start")
     state = checkpoints.load_tree(checkpoint.directory, checkpoint.name, like)
     path = checkpoint.directory / f"{checkpoint.name}.json"
     rows = stored_rows(path, manifest, "history", Row)
@@ -128,7 +126,7 @@ def stored_rows(path: Path, manifest: dict[str, Any], key: str, row: Any) -> lis
         row: type of a row, such as `tuple[int, float | None]`.
 
     Raises:
-        InputError: the manifest has no such rows, or values of one column have different shapes.
+        InputError: the rows are missing, or the values of one column have different shapes.
     """
     try:
         rows = msgspec.convert(manifest.get(key), list[row])
@@ -140,5 +138,5 @@ def stored_rows(path: Path, manifest: dict[str, Any], key: str, row: Any) -> lis
 
 
 def has_checkpoint(directory: Path, name: str = CHECKPOINT) -> bool:
-    """Whether this folder holds a checkpoint of a run."""
+    """Whether the folder has a checkpoint of a run."""
     return is_file(directory / f"{name}.json")

@@ -1,6 +1,6 @@
-"""The one loop of all trainings: dispatches of compiled steps, with checkpoints for resuming bit for bit.
+"""The loop of all trainings: dispatches of compiled steps, with checkpoints that resume bit for bit.
 
-Gauss-Newton (Levenberg-Marquardt) is one stage, or two: on a subset of the samples if there are many, then on all.
+Gauss-Newton (Levenberg-Marquardt) has one stage, or two if there are many samples: first a subset, then all.
 """
 
 import functools
@@ -63,23 +63,42 @@ def fit(
     must_start: bool = True,
     mesh: Mesh | None = None,
 ) -> Training:
-    """Minimises a problem's loss and keeps the parameters with the lowest score.
+    """Minimises the loss of a problem and keeps the parameters with the lowest score.
 
     Args:
         problem: residual or loss, initial parameters, samples and score.
-        optimiser: `Adam` or `GaussNewton`; the latter needs parameters and data in float64.
+        optimiser: `Adam`, or `GaussNewton` for parameters and data in float64.
         checkpoint: where to store the run after every dispatch, and whether to resume a stored run.
         report: called after every dispatch.
-        seconds: time limit of this call, compilation included, also for a resumed run. It is checked between
-            dispatches; at least one dispatch runs. The schedule of the learning rate does not depend on it.
-        must_start: whether an initial loss that is not finite raises an error; otherwise it is a result.
-        mesh: devices that share the training. Several seeds are split over them, and every device trains its own. With
-            one seed the samples are split: those of a step's batch for Adam, all of them for Gauss-Newton; every device
-            computes the whole score. Checkpoints do not depend on the devices; results do only by rounding.
+        seconds: time limit of this call with compilation, also for a resumed run. It is checked between dispatches, and
+            at least one dispatch runs. The learning rate schedule does not depend on it.
+        must_start: raise an error if the initial loss is not finite; otherwise report it in the result.
+        mesh: devices that share the training. They split several seeds. With one seed they split the samples (of a
+            batch for Adam, all for Gauss-Newton), and each computes the whole score. Checkpoints do not depend on the
+            devices, and results only within rounding.
+
+    Returns:
+        The best parameters, the history of losses and scores, and the reason for the end (`stop`).
 
     Raises:
         InputError: settings are out of range, the initial loss is not finite, the checkpoint belongs to another run, or
             the number of devices does not divide the samples of a batch.
+
+    Example:
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> import dln_jax
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> x = jnp.linspace(0.0, 3.0, 50)
+        >>> wave = dln_jax.Problem(
+        ...     residual=lambda w, x, y: w[0] * jnp.sin(w[1] * x) - y,
+        ...     parameters=jnp.ones(2),
+        ...     arrays=(x, 0.5 * jnp.sin(1.2 * x)),
+        ...     score=lambda w: (jnp.mean((w[0] * jnp.sin(w[1] * x) - 0.5 * jnp.sin(1.2 * x)) ** 2), jnp.nan),
+        ... )
+        >>> result = dln_jax.fit(wave, dln_jax.GaussNewton(steps=20))
+        >>> print(result.parameters.round(6), result.stop.reason)
+        [0.5 1.2] finished
     """
     began = time.perf_counter()
     require_positive(seconds=seconds)
@@ -114,7 +133,7 @@ def fit(
                 run, dispatched = run._replace(state=state), True
                 ended = stage.ended(state)
                 if ended and ended.reason == "not finite" and np.array_equal(before, state.step):
-                    continue  # nothing to report, and the stored state is as good
+                    continue  # the stored state is already the last good one
                 at = Progress(plain(state.step), loss, validation, monitor, train_seconds, stage.name)
                 history.append(at)
                 if checkpoint is not None:
@@ -133,19 +152,19 @@ class NewtonState(NamedTuple):
 
     solver: LevenbergMarquardtState
     earlier: Array
-    """[] iterations of the stage before this one."""
+    """[] iterations of the previous stage."""
     best: Best
 
     @property
     def step(self) -> int:
-        """Iterations done; with several seeds, their maximum."""
+        """Number of iterations; the maximum over several seeds."""
         return int(self.earlier) + int(np.max(np.asarray(self.solver.iteration)))
 
 
 def newton_stages(problem: Problem, optimiser: GaussNewton, shared: Sharing) -> list[Stage]:
     """Returns one stage, or two if the run starts on a subset of the samples."""
     if problem.residual is None:
-        raise InputError("Gauss-Newton needs the residuals of a sample, which this problem lacks; take Adam")
+        raise InputError("Gauss-Newton needs residuals, but this problem has only a loss; use Adam")
     leaves = jax.tree.leaves(problem.parameters)
     seeds = leaves[0].shape[0] if problem.several else 1
     count = sum(leaf.size for leaf in leaves) // seeds
@@ -181,13 +200,13 @@ def _newton_stage(
         return Stop("finished", state.step) if done else None
 
     def remaining(state: NewtonState) -> int:
-        """Largest number of iterations left to the seeds that still run."""
+        """Largest number of remaining iterations over the seeds that still run."""
         solver = state.solver
         done = np.ravel(solver.iteration)[np.ravel(solver.status) == Status.RUNNING]
         return max(iterations - int(done.min()), 0) if done.size else 0
 
     def compile_(state: NewtonState) -> Dispatch:
-        """Compiles two programs: the iterations (quickly), and their score with the best state so far."""
+        """Compiles two programs: the iterations (with quick compilation), and the score that keeps the best state."""
         chunks = jax.jit(lambda arrays: levenberg_marquardt.in_chunks(arrays, shared.samples))(arrays)
         chunks = replicate(chunks, shared.seeds) if shared.samples is None else shard(chunks, shared.samples)
         advance = spread(lambda whole, solver: iterate(solver, *whole, samples=len(arrays[0])), shared.seeds)

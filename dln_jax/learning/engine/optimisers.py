@@ -1,8 +1,8 @@
 """The optimisers of `fit`: their settings, the choice between them, and Adam as a stage of a run.
 
-A dispatch of Adam runs whole epochs in one loop on the device, with on-device shuffling; the best parameters are chosen
-by validation. The permutation of an epoch depends only on the run's key and the epoch's number, so a resumed run takes
-exactly the steps of an uninterrupted one.
+A dispatch of Adam runs whole epochs in one loop on the device, with on-device shuffling. Validation chooses the best
+parameters. The permutation of an epoch depends only on the run's key and the epoch number, so a resumed run takes
+exactly the same steps as an uninterrupted one.
 """
 
 import math
@@ -33,53 +33,95 @@ from dln_jax.solvers.normal_equations import count, jacobian_bytes
 from dln_jax.types import InputError, require_positive
 
 MOST_PARAMETERS = 2_000
-"""With more parameters P, the P³ of one iteration costs more than a thousand steps of Adam, so `suited` takes Adam."""
+"""With more parameters P, one iteration (P³) costs more than a thousand Adam steps, so `suited` chooses Adam."""
 MOST_BYTES = 2**31
 """Largest memory that `suited` allows for the normal equations and a chunk of the Jacobian."""
 
 
 class Adam(NamedTuple):
-    """AdamW on minibatches: linear warm-up of the learning rate, then cosine decay.
+    """Settings of AdamW on minibatches (Kingma and Ba 2015; Loshchilov and Hutter 2019), for `fit`.
 
-    The second moment forgets within a hundred steps by default. Residuals shrink by orders of magnitude during a run,
-    and a longer memory keeps the steps too small: the validation torque MSE is 9e-7, against 4e-6 with 0.999 and the
-    best of three learning rates.
+    With the gradient g of a batch, a step is m ← β₁ m + (1 - β₁) g, v ← β₂ v + (1 - β₂) g², then
+    w ← w - η (m / (1 - β₁ᵗ) / √(v / (1 - β₂ᵗ)) + λ w). The learning rate η rises linearly, then decays as a cosine.
+
+    The default β₂ of 0.99 forgets within a hundred steps. Residuals shrink by orders of magnitude during a run, so a
+    longer memory keeps the steps too small: the two-link arm reaches a validation torque MSE of 9e-7, against 4e-6 with
+    0.999 and the best of three learning rates.
+
+    Raises:
+        InputError: `fit` refuses settings out of range.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import dln_jax
+        >>> x = jnp.linspace(-1.0, 1.0, 64)
+        >>> line = dln_jax.Problem(
+        ...     residual=lambda w, x, y: w[0] * x + w[1] - y,
+        ...     parameters=jnp.zeros(2),
+        ...     arrays=(x, 3 * x + 1),
+        ...     score=lambda w: (jnp.mean((w[0] * x + w[1] - 3 * x - 1) ** 2), jnp.nan),
+        ... )
+        >>> fit = dln_jax.fit(line, dln_jax.Adam(steps=400, batch=16, learning_rate=0.1))
+        >>> print(fit.parameters.round(2))
+        [3. 1.]
     """
 
     steps: int = 20_000
-    """Rounded up to whole epochs."""
+    """Number of steps, rounded up to whole epochs."""
     batch: int = 512
     """Samples per step, drawn without replacement; at most all of them."""
     learning_rate: float = 5e-3
-    """Peak of the schedule."""
+    """Largest learning rate η."""
     weight_decay: float = 1e-5
-    """Decoupled weight decay."""
+    """Decoupled weight decay λ."""
     patience: int = 10_000
     """Training stops after this many steps without a lower score."""
     second_moment_decay: float = 0.99
+    """Decay β₂ of the second moment per step."""
     warm_up_share: float = 0.02
-    """Share of the steps in the warm-up; 0 with a final share of 1 gives a constant rate."""
+    """Fraction of the steps that warm up; 0 with a `final_share` of 1 gives a constant rate."""
     final_share: float = 1e-3
-    """Learning rate after the last step, as a share of the peak."""
+    """Learning rate after the last step, as a fraction of the largest."""
     steps_per_dispatch: int = 200
-    """Steps between two scores; rounded up to whole epochs."""
+    """Steps between two scores, rounded up to whole epochs."""
     rule: optax.GradientTransformation | None = None
-    """Another optimiser of optax in place of AdamW and its schedule, in memory only."""
+    """Any optimiser of optax, which replaces AdamW and its schedule; it is not stored."""
 
 
 class GaussNewton(NamedTuple):
-    """Levenberg-Marquardt on all samples at once, in float64.
+    """Settings of Gauss-Newton with Levenberg-Marquardt damping on all samples, in float64, for `fit`.
 
-    With many more samples than parameters, a run may take its first iterations on a subset, at a fraction of the cost,
-    and its last ones on all samples.
+    With the residuals r of N samples and J = dr/dw, an iteration solves (JᵀJ / N + damping s I) v = -Jᵀr / N, adds the
+    geodesic acceleration of Transtrum and Sethna (2012), and adapts the damping as Nielsen (1999) does.
+    `solvers.levenberg_marquardt` has the details. With many more samples than parameters, a run may take its first
+    iterations on a subset, which is cheaper.
+
+    Raises:
+        InputError: `fit` refuses settings out of range, and parameters that are not float64.
+
+    Example:
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> import dln_jax
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> x = jnp.linspace(0.0, 1.0, 50)
+        >>> decay = dln_jax.Problem(
+        ...     residual=lambda rate, x, y: jnp.exp(-rate * x) - y,
+        ...     parameters=jnp.ones(()),
+        ...     arrays=(x, jnp.exp(-2.5 * x)),
+        ...     score=lambda rate: (jnp.mean((jnp.exp(-rate * x) - jnp.exp(-2.5 * x)) ** 2), jnp.nan),
+        ... )
+        >>> print(dln_jax.fit(decay, dln_jax.GaussNewton(steps=20)).parameters.round(6))
+        2.5
     """
 
     steps: int = 150
     """Largest number of iterations on all samples."""
     coarse_steps: int = 0
-    """Largest number of iterations on the first `coarse_samples`, before those on all."""
+    """Largest number of iterations on the first `coarse_samples`, before the iterations on all."""
     coarse_samples: int = 2_048
-    """The first samples, so they must be in random order. Sets with fewer than twice as many skip that stage."""
+    """Size of the subset: the first samples, so give them in random order. A set with fewer than twice as many skips
+    this stage."""
     improvement: float = 0.0
     """A stage ends when an iteration decreases the loss by less than this fraction."""
     target: float = -math.inf
@@ -107,10 +149,10 @@ def check(optimiser: Optimiser) -> None:
 
 
 def suited(parameters: Any, samples: int, residuals: int) -> tuple[str, str]:
-    """Returns the name of the optimiser that suits parameters of these shapes, and a sentence with the reason.
+    """Returns the name of the optimiser that suits parameters of these shapes, and the reason as a sentence.
 
-    Gauss-Newton brings P parameters to errors of 1e-8 and below in seconds while its P x P equations are small; the
-    cost of Adam's steps grows only with P.
+    Gauss-Newton reaches errors of 1e-8 and below in seconds while its P x P equations are small. The cost of an Adam
+    step grows only with P.
     """
     size = count(parameters)
     needed = jacobian_bytes(parameters, samples, residuals, chunk_size=CHUNK, keep=False)
@@ -121,7 +163,7 @@ def suited(parameters: Any, samples: int, residuals: int) -> tuple[str, str]:
 
 
 def optimiser_named(name: str, *, precision: str, **settings: Any) -> Optimiser:
-    """Builds an optimiser by name. Settings that it lacks are ignored; a setting of `None` takes its default.
+    """Builds an optimiser by name; ignores settings of other optimisers, and `None` means the default.
 
     Raises:
         InputError: an unknown name, a setting out of range, or Gauss-Newton in a precision other than f64.
@@ -137,12 +179,12 @@ def optimiser_named(name: str, *, precision: str, **settings: Any) -> Optimiser:
 
 
 def name_of(optimiser: Optimiser) -> str:
-    """The name of an optimiser in command lines."""
+    """Returns the name of an optimiser on the command line."""
     return next(name for name, kind in NAMES.items() if isinstance(optimiser, kind))
 
 
 def transformation(adam: Adam) -> optax.GradientTransformation:
-    """AdamW with these settings, or the stated rule."""
+    """Returns AdamW with these settings, or the given rule."""
     if adam.rule is not None:
         return adam.rule
     rate = adam.learning_rate
@@ -164,14 +206,14 @@ class AdamState(NamedTuple):
     parameters: Any
     optimiser: optax.OptState
     key: Array
-    """[2] raw key data, which can be stored without conversion."""
+    """[2] raw key data, which needs no conversion for storing."""
     epoch: Array
     """[] epochs done."""
     step: Array
     """[] steps done."""
     best: Best
     failed_step: Array
-    """[] steps before the first loss that was not finite, or -1. If it is set, the rest is as before the dispatch."""
+    """[] step with the first non-finite loss, or -1. If set, all other fields are as before the dispatch."""
 
 
 def stages(problem: Problem, adam: Adam, shared: Sharing) -> list[Stage]:
@@ -183,7 +225,7 @@ def stages(problem: Problem, adam: Adam, shared: Sharing) -> list[Stage]:
     samples = problem.arrays[0].shape[0]
     batch = min(adam.batch, samples)
     shares(shared.samples, batch, "samples of a batch")
-    batches = samples // batch  # samples that do not fill a last batch are left out of that epoch
+    batches = samples // batch  # an epoch leaves out samples that do not fill a batch
     epochs = -(-adam.steps // batches)
     most = min(epochs, -(-adam.steps_per_dispatch // batches))
     loss, optimiser = loss_of(problem), transformation(adam)
@@ -200,7 +242,7 @@ def stages(problem: Problem, adam: Adam, shared: Sharing) -> list[Stage]:
         )
 
     def batches_of(state: AdamState) -> Any:
-        """Batches of a dispatch, with one permutation per epoch; devices that share them get their own part."""
+        """Returns the batches of a dispatch, one permutation per epoch; each device gets its part of shared batches."""
 
         def order(epoch: Array) -> Array:
             key = jax.random.fold_in(jax.random.wrap_key_data(state.key), epoch)
@@ -223,7 +265,7 @@ def stages(problem: Problem, adam: Adam, shared: Sharing) -> list[Stage]:
                 parameters=optax.apply_updates(state.parameters, updates),
                 optimiser=optimiser_state,
                 step=state.step + 1,
-                # Number of the first loss that is not finite; the steps after it are discarded with the dispatch.
+                # Step of the first non-finite loss; later steps are discarded with the dispatch.
                 failed_step=jnp.where(jnp.isfinite(value) | (state.failed_step >= 0), state.failed_step, state.step),
             )
             return state, total + value
@@ -236,7 +278,7 @@ def stages(problem: Problem, adam: Adam, shared: Sharing) -> list[Stage]:
         failed_step = jnp.where(finite | (state.failed_step >= 0), state.failed_step, state.step)
         # One copy per dispatch keeps the last good state; a test in every step would slow down the loop.
         state = jax.tree.map(lambda new, old: jnp.where(failed_step < 0, new, old), state, before)
-        # Devices of different models may round differently: all continue from the state of the first.
+        # Devices of different types may round differently, so all continue from the state of the first.
         state = first(state, shared.samples)
         value, shown = first(problem.score(state.parameters), shared.samples)
         best = better_of(state.best, state.parameters, value, state.step)
@@ -268,7 +310,7 @@ def stages(problem: Problem, adam: Adam, shared: Sharing) -> list[Stage]:
 def _permutation(key: Array, count: int) -> Array:
     """Returns a random order of 0..count-1.
 
-    Up to 2^16 it sorts single words twice, with random bits above the index: four times as fast as
+    Up to 2^16 it sorts single words twice, with random bits above the index, four times as fast as
     `jax.random.permutation`. Ties in one sort keep the order of the other; at 2^16, about 0.5 pairs tie in both.
     """
     place_bits = max(1, (count - 1).bit_length())

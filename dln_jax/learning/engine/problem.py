@@ -1,4 +1,4 @@
-"""Inputs, stages and results of a training run, for any model and optimiser, and how devices share the work."""
+"""Inputs, stages and results of a training run for any model and optimiser, and the sharing of work by devices."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -15,28 +15,44 @@ from dln_jax.scale import on_devices, spread
 from dln_jax.types import InputError, Scalar
 
 NO_START = "the loss is not finite before training; look for very large numbers in the data"
-"""Error message of a training whose initial loss is not finite."""
+"""Error message for an initial loss that is not finite."""
 
 
 class Problem(NamedTuple):
-    """Loss, initial parameters, samples and score of a training."""
+    """A training problem for `fit`: residual or loss, initial parameters, samples and score.
+
+    The loss is (1/N) Σₙ |r(w, sampleₙ)|². `fit` keeps the parameters with the lowest score, which usually is the error
+    on validation samples. Functions and arrays are JAX's; units are your own.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import dln_jax
+        >>> x, held_out = jnp.linspace(-1.0, 1.0, 40), jnp.array([-0.5, 0.5])
+        >>> square = dln_jax.Problem(
+        ...     residual=lambda w, x, y: w["a"] * x**2 - y,
+        ...     parameters={"a": jnp.zeros(())},
+        ...     arrays=(x, 2 * x**2),
+        ...     score=lambda w: (jnp.mean((w["a"] * held_out**2 - 2 * held_out**2) ** 2), jnp.nan),
+        ... )
+        >>> print(dln_jax.fit(square, dln_jax.Adam(steps=300, batch=8, learning_rate=0.1)).parameters["a"].round(2))
+        2.0
+    """
 
     residual: Callable[..., Array] | None
-    """(parameters, *sample) -> the residuals of one sample, of any shape; the loss is the mean over samples of the sum
-    of their squares. `None` if the loss has no such form."""
+    """(parameters, *sample) -> residuals r of one sample, of any shape; `None` if you give `loss` instead."""
     parameters: Any
-    """Initial parameters."""
+    """Initial parameters w, any tree of arrays."""
     arrays: tuple[Any, ...]
-    """Samples on axis 0; `None` is passed on unchanged."""
+    """Samples on axis 0 of each array; a `None` is passed on."""
     score: Callable[[Any], tuple[Array, Array]]
-    """Parameters of one seed -> the score to minimise, and a score for display only (NaN for none)."""
+    """Parameters of one seed -> the score to minimise, and a second score for display (NaN for none)."""
     seed: int | Array = 0
-    """Seed of the order of the samples. An array [K] trains K seeds in one program, with the results of K runs; the
+    """Seed of the sample order. An array [K] trains K seeds in one program, with the results of K separate runs; the
     parameters then have a leading axis of K."""
     loss: Callable[[Any, Any], Array] | None = None
-    """(parameters, batch) -> the loss that Adam minimises, if it is not the mean of squared residuals."""
+    """(parameters, batch) -> loss for Adam, if it is not the mean of squared residuals."""
     loss_is_mean: bool = True
-    """Whether `loss` is the mean of the losses of equal parts of a batch, so that devices may share its samples."""
+    """Whether `loss` averages over the samples, so that devices may split a batch."""
 
     @property
     def several(self) -> bool:
@@ -45,7 +61,7 @@ class Problem(NamedTuple):
 
 
 def loss_of(problem: Problem) -> Callable[[Any, Any], Scalar]:
-    """(parameters of one seed, batch) -> the loss."""
+    """Returns (parameters of one seed, batch) -> loss."""
     if problem.loss is not None:
         return problem.loss
     residual = problem.residual
@@ -55,7 +71,7 @@ def loss_of(problem: Problem) -> Callable[[Any, Any], Scalar]:
 
 
 def mean_square(residual: Callable[..., Array], batch: tuple[Any, ...]) -> Scalar:
-    """Mean over samples of the sum of squared residuals."""
+    """Returns the mean over samples of the sum of squared residuals."""
     residuals = jax.vmap(residual)(*batch)
     return jnp.mean(jnp.sum(residuals**2, axis=tuple(range(1, residuals.ndim))))
 
@@ -69,12 +85,12 @@ def selected_by(
     *,
     error: Callable[..., Array] | None = None,
 ) -> Problem:
-    """Builds the problem of a residual whose mean square over held-out samples selects the parameters.
+    """Builds a problem with the mean square of a residual over held-out samples as the score.
 
     Args:
-        held_out: samples of the score.
+        held_out: samples for the score.
         residual, parameters, arrays, seed: as in `Problem`.
-        error: (parameters, *sample) -> residuals of the score, if they differ from those of the loss.
+        error: (parameters, *sample) -> residuals for the score, if they differ from the loss.
     """
     judged = error or residual
 
@@ -85,14 +101,14 @@ def selected_by(
 
 
 def arrays_of(record: Any, keys: Sequence[str], dtype: Any = jnp.float64) -> tuple[Array, ...]:
-    """Returns fields of a record of NumPy arrays on the device; `InputError` if one is missing or squares overflow."""
+    """Copies fields of a record of NumPy arrays to the device; `InputError` if one is missing or squares overflow."""
     if missing := [key for key in keys if getattr(record, key) is None]:
-        raise InputError(f"the data have no {', '.join(missing)}, which this model is fitted to; add it to the file")
+        raise InputError(f"the data have no {', '.join(missing)}, but this fit needs it; add it to the file")
     return tuple(on_device(key, getattr(record, key), dtype) for key in keys)
 
 
 def unmonitored(value: Scalar) -> tuple[Scalar, Scalar]:
-    """Returns a score with nothing to display beside it."""
+    """Returns a score without a second score for display."""
     return value, jnp.full_like(value, jnp.nan)
 
 
@@ -113,17 +129,17 @@ def no_best(parameters: Any) -> Best:
 
 
 def better_of(best: Best, parameters: Any, validation: Array, step: Array) -> Best:
-    """Returns the better of one seed's best and current parameters; NaN is never better."""
+    """Returns the better of the best and the current parameters of one seed; NaN is never better."""
     better = validation < best.validation
     return jax.tree.map(lambda new, old: jnp.where(better, new, old), Best(parameters, validation, step), best)
 
 
 class Progress(NamedTuple):
-    """State of a run after a dispatch: numbers, or arrays [seeds] if several seeds train together."""
+    """Progress of a run after a dispatch: numbers, or arrays [seeds] if several seeds train together."""
 
     step: Any
     loss: Any
-    """For Adam, the mean over the steps of the dispatch."""
+    """Training loss; for Adam, the mean over the steps of the dispatch."""
     validation: Any
     """Score that selects the parameters."""
     monitor: Any
@@ -140,7 +156,7 @@ class Stop(NamedTuple):
     reason: str
     """"finished", "no improvement", "time" or "not finite"."""
     step: int
-    """Steps taken; for "not finite", the steps before the loss that was not finite."""
+    """Number of steps; for "not finite", the steps before the first non-finite loss."""
 
 
 class Training(NamedTuple):
@@ -173,7 +189,7 @@ def silent(progress: Progress) -> None:
 
 
 def losses(at: Progress) -> str:
-    """Losses for a line of progress; medians over seeds."""
+    """Formats the losses for a line of progress, as medians over seeds."""
     return f"loss {np.median(at.loss):.2e}  validation {np.median(at.validation):.2e}"
 
 
@@ -187,7 +203,7 @@ def one_after_the_other(histories: Iterable[list[Progress]]) -> list[Progress]:
 
 
 def plain(values: Any) -> Any:
-    """A scalar as a Python number, an array as a NumPy one."""
+    """Converts a scalar to a Python number, and an array to NumPy."""
     array = np.asarray(values)
     return array if array.ndim else array.item()
 
@@ -201,39 +217,39 @@ class Stage(NamedTuple):
 
     name: str
     start: Callable[[Any], Any]
-    """Last state of the stage before, or `None` for the first stage -> the initial state."""
+    """Last state of the previous stage (`None` for the first) -> initial state."""
     compile: Callable[[Any], Dispatch]
-    """A state -> a compiled dispatch of some steps and their score."""
+    """State -> compiled dispatch of some steps and their score."""
     ended: Callable[[Any], Stop | None]
-    """A state -> the reason why the stage is over, or `None` if it is not."""
+    """State -> reason for the end of the stage, or `None` to continue."""
 
 
 class Sharing(NamedTuple):
-    """Meshes that split the seeds or the samples; at most one of them."""
+    """Mesh that splits either the seeds or the samples."""
 
     seeds: Mesh | None
-    """Every device trains its own seeds, as on its own: only results are sent. Some devices may have one seed more."""
+    """Each device trains its own seeds and sends only results; some devices may have one seed more."""
     samples: Mesh | None
-    """Every device sums over its own samples; every step adds up the sums."""
+    """Each device sums over its own samples, and each step adds these sums."""
 
 
 def sharing(problem: Problem, mesh: Mesh | None) -> Sharing:
-    """Returns what the devices of a mesh share in this problem: seeds or samples.
+    """Decides whether the devices of a mesh split the seeds or the samples.
 
     Raises:
-        InputError: one seed, with a loss that is not the mean of the losses of parts of a batch.
+        InputError: a single seed, with a loss that is not a mean over samples.
     """
     if mesh is None or np.size(problem.seed) > 1:
         return Sharing(mesh, None)
     if problem.loss is not None and not problem.loss_is_mean:
-        raise InputError("the loss is of a whole batch, whose samples cannot be split: train it on one device")
+        raise InputError("the loss is not a mean over samples, so devices cannot split a batch; train on one device")
     return Sharing(None, mesh)
 
 
 def by_devices(function: Callable[[Any, Any], Any], shared: Sharing) -> Callable[[Any, Any], Any]:
-    """Distributes a function of (whole, seeds): every device evaluates it for its own seeds.
+    """Distributes a function of (whole, seeds) over devices, each with its own seeds.
 
-    Devices that share the samples work on all seeds together, and the function itself adds up their sums.
+    Devices that split the samples work on all seeds together, and the function itself adds their sums.
     """
     together = on_devices(lambda arguments, _: function(*arguments), shared.samples)
     return spread(lambda whole, seeds: together((whole, seeds), None), shared.seeds)

@@ -1,1 +1,1 @@
-"""The ways of fitting a model of dynamics to a log: functions of settings, log, parts and context."""
+"""Ways of fitting a model of dynamics to a log, as functions of settings, log, parts and context."""

@@ -1,9 +1,8 @@
 """Model selection: fits models from the strongest prior knowledge to the weakest, and keeps one by validation.
 
-Models are compared on the validation motions by squared torque errors in units of the joints' variances, so that a
-wrist counts as much as a shoulder. Models whose mass matrices are positive definite come before others, unless they
-explain much less: without such a matrix, accelerations are wrong. The selection ends early if the errors equal the
-noise of the torques, or rounding, and when time is up.
+Validation compares squared torque errors in units of the joints' variances, so that a wrist counts as much as a
+shoulder. Models with positive definite mass matrices are preferred unless they explain much less, because accelerations
+are wrong otherwise. The selection ends when errors reach the noise of the torques or rounding, or when time is up.
 """
 
 import math
@@ -37,28 +36,28 @@ from dln_jax.types import InputError, JointVector, Needs
 from dln_jax.zoo.run import load
 
 SELECTION_SECONDS, CANDIDATE_SECONDS = 300.0, 120.0
-"""Default time limits, s: for the whole selection, and for one search or network in it."""
+"""Default time limits, s: for the whole selection, and for each search or network."""
 EXACT = 1e-12
 """No further candidate is tried once the normalised error of every joint is below this."""
 LEAST_NOISE, MOST_NOISE = 0.5, 1.2
-"""Range of a joint's error, relative to the noise's share of the torque's variance, that counts as that noise. A lower
-error shows that the estimate of the noise is wrong."""
+"""Range of a joint's error relative to its noise variance that counts as noise. A lower error shows that the noise
+estimate is wrong."""
 USEFUL, PRICE = 0.25, 10.0
-"""Largest mean normalised error of a model that a verdict does not refuse, as in `metrics.verdict`, and the largest
-factor on the least mean error that a positive definite mass matrix may cost."""
+"""Largest mean normalised error that a verdict does not refuse, as in `metrics.verdict`, and the largest increase of
+the mean error, as a factor, for a positive definite mass matrix."""
 
 
 def fit(settings: Automatic, log: Log, parts: Parts, context: Context) -> Fit:
-    """Fits the candidates, says them in a table and returns the selected one.
+    """Fits the candidates, prints them as a table and returns the selected one.
 
-    The devices of a mesh share the final network; all other candidates are fitted on one device.
+    The devices of a mesh share the final network; one device fits all other candidates.
 
     Raises:
         InputError: no model could be fitted.
     """
     train, validation, _ = parts.sets
     for key in ("q", "qd", "qdd"):
-        spread(key, getattr(train, key))  # refuses numbers that are far too large
+        spread(key, getattr(train, key))  # refuses implausibly large numbers
     torque_scale(train)
     log = log._replace(needs=with_joint_laws(log.needs))
     limited = math.isfinite(context.until)
@@ -87,22 +86,22 @@ def compare(
     definite: Callable[[Any], bool],
     say: Callable[[str], None],
 ) -> tuple[Trial, list[dict[str, Any]], str]:
-    """Fits candidates in order; chooses the first that no other betters significantly, definite ones before others.
+    """Fits candidates in order and chooses the first that no other one significantly improves; prefers definite models.
 
-    Returns the chosen trial, a row on each candidate that was tried, and why the comparison ended, if it did early.
+    Returns the chosen trial, a row for each candidate, and the reason for an early end, if any.
 
     Args:
-        candidates: name -> function that returns a model with parameters, or the reason why there is none; most
-            structured first.
-        train: samples that they are fitted to; the variances of their torques are the units of the errors.
+        candidates: name -> function that returns a model with parameters, or a reason for failure; the most structured
+            model first.
+        train: samples to fit; their torque variances are the units of the errors.
         validation: other motions.
-        noise: standard deviation of the joints' torque noise, N m or N, or NaN; the comparison ends at such errors.
-        until: reading of `time.perf_counter` after which no further candidate is tried, once one is fitted.
+        noise: standard deviation of the torque noise of each joint, N m or N, or NaN; such errors end the comparison.
+        until: reading of `time.perf_counter` at which the comparison ends, after the first successful fit.
         definite: whether a model's mass matrix is positive definite; true for models without one.
-        say: takes a line on each candidate.
+        say: takes a line for each candidate.
 
     Raises:
-        InputError: torques that do not vary, or no candidate that could be fitted.
+        InputError: torques do not vary, or no candidate could be fitted.
     """
     scale, rows, ended = torque_scale(train), {}, ""
     share = (noise / scale) ** 2
@@ -126,7 +125,7 @@ def compare(
                 }
                 say(f"{name}: validation nMSE {nmse.mean():.3g}, worst joint {nmse.max():.3g}, {seconds:.1f} s")
                 return result, errors.mean(axis=1)
-            result = "its torques are not finite on validation motions"
+            result = "torques are not finite on validation motions"
         rows[name] = {"name": name, "validation_nmse": None, "seconds": seconds, "reason": result}
         say(f"{name}: {result}")
         return result, None
@@ -157,18 +156,18 @@ def compare(
 
 
 Candidate = Callable[[Log, Parts, Context], Fit | str]
-"""The fit, or the reason why there is none; an `InputError` counts as a reason."""
+"""Returns a fit, or a reason for failure; an `InputError` counts as a reason."""
 
 
 def candidates_of(settings: Automatic, log: Log) -> list[tuple[str, Candidate]]:
-    """The candidates with their names, from the strongest prior knowledge to the weakest."""
+    """Lists the candidates with their names, from the strongest prior knowledge to the weakest."""
     first, second = (parameters_of_degree(log.needs, degree) for degree in (1, 2))
     size = "too many" if first is None else f"{first:,}"
     too_large = f"its basis has {size} coefficients; at most {MOST_PARAMETERS:,} are tried"
     fits = first is not None and first <= MOST_PARAMETERS
     explicit = "trigonometric", Trigonometric().fit if fits else lambda *_: too_large
     learned = "learned-tree", LearnedTree(parents=settings.parents, kinematic_prior=settings.kinematic_prior).fit
-    # A small basis is fitted within a second; a search for joint frames takes half a minute.
+    # Fitting a small basis takes less than a second, and a search for joint frames half a minute.
     small = second is not None and second <= MOST_PARAMETERS
     return [
         *[("rigid-tree", lambda log, parts, context: identify_robot(log, parts))] * (log.robot is not None),
@@ -178,9 +177,9 @@ def candidates_of(settings: Automatic, log: Log) -> list[tuple[str, Candidate]]:
 
 
 def fit_or_load(log: Log, parts: Parts, context: Context, seconds: float, name: str, candidate: Candidate) -> Fit | str:
-    """Fits a candidate and stores it in a folder of its own, or takes it from there if the run is resumed.
+    """Fits a candidate and stores it in its own folder, or loads it from there in a resumed run.
 
-    A learned tree is fitted again: its verdict needs the search.
+    A learned tree is fitted again, because its verdict needs the search.
     """
     place = (context.folder or Path()) / "candidates" / name
     done = place / "candidate.json"
@@ -209,7 +208,7 @@ def fit_or_load(log: Log, parts: Parts, context: Context, seconds: float, name: 
 
 
 def is_definite(result: Fit, parts: Parts) -> bool:
-    """Whether the mass matrices of a model are positive definite on validation motions; true without any."""
+    """Whether a model's mass matrices are positive definite on validation motions; true if it has none."""
     if result.properties.definite or not result.properties.energy:
         return True
     data = parts.sets.validation
@@ -220,9 +219,9 @@ def is_definite(result: Fit, parts: Parts) -> bool:
 
 
 def identify_robot(log: Log, parts: Parts) -> Fit:
-    """Identifies the bodies and the friction of the robot's tree."""
+    """Identifies the inertias and friction of the robot's tree."""
     if log.robot is None:
-        raise InputError("the log names no robot, whose tree could be identified; give its file as robot=")
+        raise InputError("the log has no robot to identify; pass the robot's file as robot=")
     began, train, needs = time.perf_counter(), parts.sets.train, with_joint_laws(log.needs)
     stated = needs.velocity_scale != Needs(needs.joints).velocity_scale
     scale = needs.velocity_scale if stated else None

@@ -1,9 +1,9 @@
 """Fits without a network: linear models, Gaussian processes of energies, and trees of unknown joint frames.
 
-A search from random starts finds the frames of a tree, elimination everything else.
+A search from random starts finds the frames of a tree; elimination gives all other parameters.
 
-Validation chooses degrees, the order of the bodies, and whether friction has an offset. For other objectives than that
-of torques, Gauss-Newton refines the result.
+Validation chooses degrees, the order of the bodies, and whether friction has an offset. Gauss-Newton refines the result
+for objectives other than torques.
 """
 
 import time
@@ -43,13 +43,13 @@ from dln_jax.zoo.descriptions import Description, build, describe_for
 SAMPLES = 600
 """Default for the largest number of samples in a kernel."""
 REFINEMENTS = 50
-"""Upper bound on the Gauss-Newton steps from a direct fit, which is near the minimum."""
+"""Largest number of Gauss-Newton steps from a direct fit, which is near the minimum."""
 EXACT = 1e-12
 """A fit with a smaller normalised error needs no further term."""
 
 
 def fit_basis(settings: Trigonometric, log: Log, parts: Parts, context: Context) -> Fit:
-    """Fits the trigonometric model by least squares; without a stated degree, validation chooses the degrees first."""
+    """Fits the trigonometric model by least squares; validation chooses the degrees unless they are given."""
     began, train, say = time.perf_counter(), parts.sets.train, context.say
     degree: Any = 1 if settings.degree is None else settings.degree
     description = described(settings, log.needs, parts, context, degree=degree)
@@ -76,7 +76,7 @@ def _degrees(degrees: tuple[int, ...]) -> str:
 
 
 def fit_energies(settings: Kernel, log: Log, parts: Parts, context: Context) -> Fit:
-    """Fits two kernels, with and without the assumption of a serial chain, and selects one by validation."""
+    """Fits kernels with and without the assumption of a serial chain, and selects one by validation."""
     began, train, say = time.perf_counter(), parts.sets.train, context.say
     samples = SAMPLES if settings.samples is None else settings.samples
     require_positive(samples=samples)
@@ -105,7 +105,7 @@ def fit_energies(settings: Kernel, log: Log, parts: Parts, context: Context) -> 
 def described(
     settings: Trigonometric | Kernel | LearnedTree, needs: Needs, parts: Parts, context: Context, **keywords: Any
 ) -> Description:
-    """Describes the model, in float64 unless stated otherwise, and says on which devices it is fitted."""
+    """Describes the model, in float64 by default, and reports the devices of the fit."""
     precision = settings.precision or "f64"
     for line in device_lines(precision):
         context.say(line)
@@ -120,11 +120,11 @@ def choose_offset(
     refit: Callable[[Description], Any],
     say: Callable[[str], None],
 ) -> tuple[Description, Needs, Any]:
-    """Keeps the offset of friction beside a potential if validation motions need it.
+    """Keeps an offset of friction beside a potential if it improves the validation error.
 
     Args:
-        solution: the fit with it, with `parameters`.
-        refit: description without the offset -> its fit.
+        solution: the fit with the offset; has `parameters`.
+        refit: description without the offset -> fit.
     """
     lean = without_offset(needs)
     if lean == needs:
@@ -143,10 +143,10 @@ def choose_offset(
 
 
 def refine(start: Fit, parts: Parts, context: Context) -> Fit:
-    """Refines a direct fit by Gauss-Newton unless its objective is that of torques; keeps what validation prefers.
+    """Refines a direct fit by Gauss-Newton for objectives other than torques; keeps the better fit by validation.
 
     Raises:
-        InputError: the model has too many parameters for Gauss-Newton, or a precision that it does not support.
+        InputError: the model has too many parameters for Gauss-Newton, or its precision is f32.
     """
     if start.objective.of_torques:
         return start
@@ -158,7 +158,9 @@ def refine(start: Fit, parts: Parts, context: Context) -> Fit:
     problem = dynamics.problem(start.model, parts.sets, start.objective)._replace(parameters=start.parameters)
     refit = train(problem, GaussNewton(steps=REFINEMENTS, improvement=1e-6), seconds=context.seconds, must_start=False)
     before = start.training
-    context.say(f"refined by both sides' errors: validation {before.validation:.2e}, after it {refit.validation:.2e}")
+    context.say(
+        f"refined by Gauss-Newton: validation error {before.validation:.2e} before, {refit.validation:.2e} after"
+    )
     training = refit if refit.validation < before.validation else before
     history = one_after_the_other([before.history, refit.history])
     training = training._replace(history=history, compile_seconds=refit.compile_seconds)
@@ -166,7 +168,7 @@ def refine(start: Fit, parts: Parts, context: Context) -> Fit:
 
 
 def fit_arm(settings: LearnedTree, log: Log, parts: Parts, context: Context) -> Fit:
-    """Searches joint frames by Gauss-Newton, from random starts or near a prior, and eliminates everything else."""
+    """Searches joint frames by Gauss-Newton from random starts or near a prior, and eliminates all other parameters."""
     needs = needs_of_tree(log.needs)
     parents, prior = knowledge_of(settings, needs.degrees_of_freedom)
     description = described(settings, needs, parts, context, parents=parents, velocity_scale=needs.velocity_scale)
@@ -186,7 +188,7 @@ def fit_arm(settings: LearnedTree, log: Log, parts: Parts, context: Context) -> 
 
 
 def needs_of_tree(needs: Needs) -> Needs:
-    """Converts the needs to those of a learned tree, whose friction is viscous, dry and an offset per joint.
+    """Converts needs for a learned tree, which has viscous friction, dry friction and an offset per joint.
 
     Raises:
         InputError: friction laws that a learned tree does not have.
@@ -198,14 +200,14 @@ def needs_of_tree(needs: Needs) -> Needs:
 
 
 def with_joint_laws(needs: Needs) -> Needs:
-    """Needs with friction of the joints in place of friction by a network."""
+    """Replaces friction by a network with joint friction laws."""
     if not needs.friction:
         return needs
     return needs._replace(friction=False, joint_friction=needs.joint_friction or USUAL)
 
 
 def knowledge_of(settings: Arm, d: int) -> tuple[tuple[int, ...] | None, KinematicPrior | None]:
-    """The stated parents of d joints, counted from 0 as everywhere else in the code, and the stated kinematic prior."""
+    """Returns the given parents of d joints, counted from 0, and the given kinematic prior."""
     parents, path = None, settings.kinematic_prior
     if settings.parents is not None:
         try:

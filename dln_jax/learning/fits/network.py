@@ -1,4 +1,4 @@
-"""Networks, trained by an optimiser under a checkpoint: one seed, several in one program, or networks that grow."""
+"""Trains networks with checkpoints: one seed, several seeds in one program, or networks of growing size."""
 
 import itertools
 from dataclasses import replace
@@ -30,13 +30,13 @@ from dln_jax.zoo.descriptions import build, describe_for
 
 STRUCTURED = "structured-delan"
 WITHOUT_STRUCTURE = 400
-"""Default number of iterations of a black box, which converges later than a structured network."""
+"""Default number of iterations for a black box, which converges more slowly than a structured network."""
 WIDTHS, DEPTHS = (4, 8, 16, 32), (1, 2)
-"""Sizes of networks that grow."""
+"""Sizes of growing networks."""
 
 
 def fit(settings: Network, log: Log, parts: Parts, context: Context) -> Fit:
-    """Trains the network; cross-validation selects one of several seeds, and a target grows networks.
+    """Trains a network; cross-validation selects one of several seeds, and a target makes the network grow.
 
     Raises:
         InputError: settings out of range, data that cannot determine the model, or a loss that is not finite.
@@ -50,7 +50,7 @@ def fit(settings: Network, log: Log, parts: Parts, context: Context) -> Fit:
     training = train_plan(plan, parts.sets, context.within(seconds))
     finite = np.isfinite(np.ravel(training.validation))
     if training.stop.reason != "not finite" and not finite.any():
-        raise InputError("no validation error is finite; there is no model: look for large numbers in the data")
+        raise InputError("all validation errors are infinite or NaN; look for very large numbers in the data")
     best = int(np.argmin(np.where(finite, training.validation, np.inf)))
     if several:
         chosen = cross_validate(plan, parts.sets, quiet, settings.folds)
@@ -59,15 +59,15 @@ def fit(settings: Network, log: Log, parts: Parts, context: Context) -> Fit:
 
 
 def of_training(plan: Fit, training: Training, best: int = 0, *, cross_validated: bool = False) -> Fit:
-    """The plan with the parameters of a training."""
+    """Completes a plan with the parameters of a training."""
     trained = replace(plan, training=training, best=best, cross_validated=cross_validated)
     return replace(trained, parameters=trained.of_seed(best))
 
 
 def plan_network(settings: Network, log: Log, parts: Parts, context: Context) -> Fit:
-    """Plans the network and its optimiser, as stated or as the sizes of model and data suggest: a fit not yet trained.
+    """Plans the network and its optimiser, as given or by the size of model and data; returns an untrained fit.
 
-    Says what it chose.
+    Reports the choice.
     """
     require_consistent(settings, context.seed)
     name, optimizer, reason = settings.model, settings.optimizer, ""
@@ -100,7 +100,7 @@ def plan_network(settings: Network, log: Log, parts: Parts, context: Context) ->
         chosen["steps"] = WITHOUT_STRUCTURE
     optimiser = optimiser_named(optimizer, precision=precision, **chosen)
     if needs != log.needs:
-        context.say("friction has no offset: the potential takes any constant")
+        context.say("friction has no offset term, since the potential can represent any constant force")
     if properties.canonical and objective.of_torques:
         context.say("no momenta p in the data: the Hamiltonian is fitted to torques")
     context.say(f"{name}, {precision}, {optimizer}{f' ({reason})' if reason else ''}")
@@ -119,7 +119,7 @@ def plan_network(settings: Network, log: Log, parts: Parts, context: Context) ->
 
 
 def require_consistent(settings: Network, seed: int) -> None:
-    """Refuses numbers out of range, and settings that other settings make meaningless."""
+    """Raises `InputError` for numbers out of range and for settings that contradict each other."""
     require_positive(seeds=settings.seeds, folds=settings.folds)
     require_seed(seed, settings.seeds)
     for name, optimizer in (*((name, "adam") for name in OF_ADAM), ("samples", "gauss-newton")):
@@ -139,7 +139,7 @@ def require_consistent(settings: Network, seed: int) -> None:
 
 
 def train_plan(plan: Fit, sets: Split, context: Context, *, name: str = CHECKPOINT) -> Training:
-    """Trains the plan on these sets in the time of the context; drawn samples are scaled by the spread of all."""
+    """Trains a plan on these sets within the time limit of the context; the spread of all samples sets the scale."""
     assert plan.optimiser is not None, "a network is trained by an optimiser"
     scale, total = plan.objective.scale(sets.train), plan.optimiser.steps
     arrays = (getattr(data, key) for data in sets for key in plan.objective.keys)
@@ -158,7 +158,7 @@ def train_plan(plan: Fit, sets: Split, context: Context, *, name: str = CHECKPOI
 
 
 def cross_validate(plan: Fit, sets: Split, context: Context, folds: int) -> int:
-    """Index of the seed with the lowest cross-validation error over folds of the motions.
+    """Returns the index of the seed with the lowest cross-validation error over folds of the motions.
 
     One or two validation motions often prefer the worse of two seeds. Every motion outside the test is in one fold.
     """
@@ -178,9 +178,9 @@ def cross_validate(plan: Fit, sets: Split, context: Context, folds: int) -> int:
 
 
 def grow(target: float, plan: Fit, parts: Parts, context: Context) -> Fit:
-    """Trains all networks of a width before the next width, up to the first width that meets the target.
+    """Trains all networks of one width, then of the next, up to the first width that meets the target.
 
-    Keeps the fastest network that meets it or, if none does, the most accurate.
+    Keeps the fastest network that meets the target, or the most accurate one if none does.
     """
     fits: list[Fit] = []
     rows: list[dict[str, Any]] = []
@@ -191,7 +191,7 @@ def grow(target: float, plan: Fit, parts: Parts, context: Context) -> Fit:
             break
         # All processes have to agree.
         if fits and of_first_process(context.seconds <= SOON, context.mesh):
-            ended = f"out of time: networks of width {width} and more were not all tried"
+            ended = f"time is up; networks of width {width} and more were not all tried"
             break
         description = {**plan.description, "width": width, "depth": depth, "shared_trunk": shared}
         own = replace(plan, description=description, model=build(description))
@@ -215,5 +215,5 @@ def grow(target: float, plan: Fit, parts: Parts, context: Context) -> Fit:
     kept = min(met or range(len(fits)), key=lambda place: rows[place][key])
     say_selection(context, f"grown until the validation error is {target:g}", rows[kept]["name"], ended, rows)
     if not met:
-        context.say(f"no candidate meets {target:g}; kept is the most accurate. More --steps or --seconds may help")
+        context.say(f"no candidate meets {target:g}; the most accurate one is kept. More --steps or --seconds may help")
     return fits[kept]

@@ -2,7 +2,7 @@
 
     fit = Network(width=16).fit(log, split_log(log), Context(seconds=60))
 
-They are options of the commands as well. Importing this module does not import JAX.
+The commands take them as options. Importing this module does not import JAX.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 ActivationName = Literal["tanh", "softplus", "silu", "gelu", "sin", "cos"]
 Precision = Literal["f32", "f64"]
 OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience", "rule")
-"""Settings of a network that only Adam has; `samples` is that of Gauss-Newton."""
+"""Settings of a network for Adam only; `samples` is for Gauss-Newton only."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Way:
     """Settings of a way of fitting."""
 
     FITTED_BY: ClassVar[str]
-    """Module and function of `learning.fits`, imported when it is called."""
+    """Module and function of `learning.fits`, imported on the first call."""
 
     def fit(
         self,
@@ -116,7 +116,7 @@ class Kernel(Way):
 
 @dataclass(frozen=True)
 class Arm(Way):
-    """Prior knowledge of an arm whose joint frames are searched."""
+    """Prior knowledge of an arm for the search of its joint frames."""
 
     parents: Unstated[str] = None
     """Parent joint of every joint, counted from 1, with 0 for the ground, such as 0,1,2,1 (default: a chain)."""

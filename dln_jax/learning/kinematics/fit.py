@@ -32,13 +32,13 @@ from dln_jax.solvers import least_squares
 from dln_jax.types import InputError, JointVector, Needs, require_positive
 
 FINALISTS, NEAR = 3, 2.0
-"""Largest number of local minima to refine and compare by validation, and largest ratio of their loss to the lowest."""
+"""Largest number of local minima to refine and compare by validation, and their largest loss relative to the lowest."""
 ROUNDS = 2
-"""Rounds of weighting the joints by their unexplained torques; more rounds change the weights by a few per cent."""
+"""Rounds of reweighting the joints by unexplained torque; more rounds change the weights by a few per cent."""
 CHUNK = 4096
-"""Samples whose columns are in memory at a time."""
+"""Number of samples per chunk of columns in memory."""
 LEAST_NOISE = 1e-7
-"""Lower bound on a joint's noise in the weights, relative to its torque."""
+"""Lower bound on the noise in a joint's weight, relative to its torque."""
 
 
 class TreeFit(NamedTuple):
@@ -54,7 +54,7 @@ class TreeFit(NamedTuple):
     validation_error: float
     """`torque_mse` of the validation samples; NaN without any."""
     parameter_count: int
-    """Parameters of the frames, without gauges, and of the linear problem."""
+    """Number of parameters of frames (without gauges) and linear problem."""
     rank: int
     """Rank of the linear problem: combinations of inertias and friction that the data determine."""
     condition: float
@@ -63,9 +63,9 @@ class TreeFit(NamedTuple):
     agreeing: int
     """Number of descents that ended at the lowest loss."""
     agreement: int
-    """Number of descents that the search required to agree (`Search.agreement`)."""
+    """Number of agreeing descents that the search required (`Search.agreement`)."""
     twin: Twin | None
-    """Comparison with another descent to the same loss; `None` without one, or if not requested."""
+    """Comparison with another descent to the same loss, if there is one and it was requested."""
     seconds: float
     """Duration of the whole call, compilation included."""
 
@@ -86,25 +86,25 @@ def fit_tree(
 ) -> TreeFit:
     """Fits a tree's frames, inertias, armature and friction to measured torques, in float64.
 
-    Gauss-Newton refines random frames on a subset of the samples, with all else eliminated (`projection`). The best are
-    refined on all samples, with joints weighted by their unexplained torque. Validation chooses between local minima
-    whose losses differ by less than a factor of two. Handedness and other gauges (see `models.trees`) are
-    arbitrary. The search goes on until another descent to the same loss has found the same arm (`agreement`).
+    Gauss-Newton refines random frames on a subset of the samples and eliminates all other parameters (`projection`).
+    The best frames are refined on all samples, with joints weighted by their unexplained torque. Validation chooses
+    between local minima with losses within a factor of two. Handedness and other gauges (see `models.trees`) are
+    arbitrary. The search continues until another descent to the same loss finds the same arm (`agreement`).
 
     Args:
         train: samples to fit, with accelerations.
-        validation: samples that choose the local minimum; the training error chooses without them.
-        parents: parent link of every link; a serial chain by default.
+        validation: samples that choose the local minimum (default: the training error chooses).
+        parents: parent link of every link (default: a serial chain).
         acceleration: acceleration of gravity, m/s².
         velocity_scale: velocity scale of dry friction, 1/s or m/s.
         settings: starts, samples and limits of the search.
         ridge: ridge of the elimination, relative to the squared length of the columns.
         rank_tolerance: tolerance of the final linear problem, as in `solvers.least_squares.solve`.
         most_samples: largest number of samples for refining frames; the final linear problem uses all.
-        report: called with lines of text about the search.
+        report: takes lines about the search.
 
     Raises:
-        InputError: torques that do not vary, a number of joints unlike the data's, or a setting out of range.
+        InputError: constant torques, a different number of joints in the data, or a setting out of range.
     """
     require_positive(ridge=ridge, most_samples=most_samples, samples=settings.samples)
     if needs.degrees_of_freedom != train.degrees_of_freedom:
@@ -124,7 +124,7 @@ def fit_tree(
         searched, twin, until, wanted = ([], 0), None, began + settings.seconds, settings
 
         def finished(descent: Descent) -> tuple[Descent, least_squares.LeastSquaresSolution, np.ndarray, np.ndarray]:
-            """The refined descent, its linear solution, and its mean squared errors by joint on both sets."""
+            """Returns the refined descent, its linear solution, and its mean squared errors by joint on both sets."""
             state, unit = _refine(program, structure, descent, every, scale, settings)
             rows = weighted(design_chunks(columns, state.frames, train, CHUNK), unit)
             solution = least_squares.solve_chunks(rows, rank_tolerance=rank_tolerance, negligible=1e-12)
@@ -153,7 +153,7 @@ def fit_tree(
                 report(f"two descents to this tree's loss found {twin.words}")
             if (twin is not None and twin.same) or starts >= settings.starts or time.perf_counter() > until:
                 break
-            # One more wave of starts, however many agree already.
+            # Always run one more wave of starts.
             wanted = settings._replace(agreement=count_agreeing(descents) + 1)
         losses = np.array([float(descent.at.loss) for descent in descents])
         parameters = _parameters(structure, state.frames, solution.x)
@@ -181,7 +181,7 @@ def _alike(one: Descent, other: Descent) -> bool:
 
 
 def _finalists(descents: list[Descent], validation: Trajectories | None) -> list[Descent]:
-    """Returns the lowest descent of every local minimum that validation may prefer to the lowest of all."""
+    """Returns the lowest descent of each local minimum that validation may prefer."""
     kept = descents[:1]
     for descent in descents[1:]:
         loss, last = float(descent.at.loss), float(kept[-1].at.loss)
@@ -199,7 +199,7 @@ def _refine(
     scale: JointVector,
     settings: Search,
 ) -> tuple[Descent, JointVector]:
-    """Continues the descent on all samples, then with the joints' residual torques as units."""
+    """Continues a descent on all samples, then with the residual torques of the joints as units."""
     unit = scale
     for last in range(ROUNDS + 1):
         state = descend(program, structure, state.frames, samples, unit, iterations=settings.iterations)
@@ -214,7 +214,7 @@ def _joint_errors(columns: Callable, frames: Frames, linear: np.ndarray, data: T
 
 
 def _columns(structure: Structure) -> Callable:
-    """(frames, q, qd, qdd) -> Phi [N, d, P] and zeros [N, d], for `design_chunks`."""
+    """Returns (frames, q, qd, qdd) -> Phi [N, d, P] and zeros [N, d], for `design_chunks`."""
 
     def one(frames: Frames, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
         return design(structure, frames, q, qd, qdd), jnp.zeros_like(q)

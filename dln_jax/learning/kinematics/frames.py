@@ -1,7 +1,7 @@
-"""Joint frames as the unknowns of a search: random ones, steps between them, and moves to other local minima.
+"""Joint frames as unknowns of a search: random frames, steps, and moves to other local minima.
 
-A kinematic prior is a rough description near which the search starts. It holds the joint axes in space at q = 0, with z
-up, and a point on every axis; or Denavit-Hartenberg rows.
+A kinematic prior is a rough description of the arm; the search starts near it. It has the joint axes in space at q = 0,
+with z up, and a point on each axis, or Denavit-Hartenberg rows.
 """
 
 import reprlib
@@ -22,10 +22,10 @@ FIELDS = {"axes": 3, "points": 3, "dh_rows": 4}
 ROUGHNESS = {"angle_degrees": 30.0, "length": 0.05}
 EXPECTED = (
     'expected {"axes": [[x, y, z], ...], "points": [[x, y, z], ...]} or {"dh_rows": [[alpha, a, d, theta], ...]}, a '
-    'row for each joint, and if known their errors, "angle_degrees" and "length"'
+    'row per joint, and optionally their errors, "angle_degrees" and "length"'
 )
 REACH = 0.15
-"""Standard deviation in m of the coordinates of a random joint's position."""
+"""Standard deviation of each coordinate of a random joint position, m."""
 
 
 class Frames(NamedTuple):
@@ -38,7 +38,7 @@ class Frames(NamedTuple):
 
 
 class KinematicPrior(NamedTuple):
-    """Frames and their deviations."""
+    """Prior frames and their standard deviations."""
 
     frames: Frames
     angle: float = float(np.radians(ROUGHNESS["angle_degrees"]))
@@ -55,7 +55,7 @@ def random_frames(d: int, random: np.random.Generator) -> Frames:
 
 
 def rough_frames(prior: KinematicPrior, random: np.random.Generator) -> Frames:
-    """Perturbs prior frames by their deviations: rotates them about random axes, and moves them."""
+    """Perturbs prior frames by their deviations: rotates them about random axes and moves them."""
     rotations, positions = map(np.asarray, prior.frames)
     directions = random.normal(size=(2, *positions.shape))
     directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -64,10 +64,10 @@ def rough_frames(prior: KinematicPrior, random: np.random.Generator) -> Frames:
 
 
 def free_directions(parents: Sequence[int], joints: Sequence[JointKind]) -> np.ndarray:
-    """Indices into a flat step [d, 6] of the coordinates that torques may identify; the others are gauges.
+    """Returns the indices into a flat step [d, 6] of the coordinates that torques can identify; the rest are gauges.
 
     A link's frame may rotate about its own z and slide along it, which leaves two tilts of the axis and two shifts
-    across it. The axis of a prismatic joint, and of a joint on the base, has a direction but no position.
+    across it. The axis of a prismatic joint, or of a joint on the base, has a direction but no position.
     """
     places = []
     for link, (parent, kind) in enumerate(zip(parents, joints, strict=True)):
@@ -96,12 +96,12 @@ def turn_round(frames: Frames, parents: Sequence[int], joint: int) -> Frames:
 
 
 def mirror_image(frames: Frames, parents: Sequence[int], joints: Sequence[JointKind]) -> Frames:
-    """Returns the mirror image: it moves in the same way under the same torques if the inertias are mirror_image too.
+    """Returns the mirror image, which moves in the same way under the same torques if the inertias are mirrored too.
 
     Reflecting x in every frame reverses the rotation of revolute joints; reversing y and z of their links restores it.
     """
     mirror, half = np.diag([-1.0, 1.0, 1.0]), np.diag([1.0, -1.0, -1.0])
-    # The ground comes last, where the index -1 points.
+    # The ground is last, at index -1.
     own = np.array([*(half if kind == "revolute" else np.eye(3) for kind in joints), np.eye(3)])
     turned = own[list(parents)] @ mirror
     positions = np.einsum("iab,ib->ia", turned, np.asarray(frames.positions))
@@ -116,7 +116,7 @@ def frames_of_axes(
     Args:
         axes: directions of the joints in space at q = 0, of any length.
         points: one point on each axis, m.
-        parents: parent link of every link, -1 for the ground; a serial chain by default.
+        parents: parent link of every link, -1 for the ground (default: a serial chain).
 
     Raises:
         InputError: arrays with a wrong shape or values that are not finite, or an axis of length zero.
@@ -127,7 +127,7 @@ def frames_of_axes(
     if not (lengths > 0).all():
         raise InputError(f"joint {int(np.argmin(lengths)) + 1} has an axis of length zero; expected a direction")
     order = list(range(-1, d - 1) if parents is None else parents)
-    # The ground comes last, where the index -1 points.
+    # The ground is last, at index -1.
     turned = np.array([*map(_with_z_along, axes / lengths[:, None]), np.eye(3)])
     into = turned[order].transpose(0, 2, 1)
     apart = points - np.append(points, np.zeros((1, 3)), axis=0)[order]
@@ -147,7 +147,7 @@ def kinematic_prior_from_json(values: Any, d: int, parents: Sequence[int] | None
     rough = {name: _positive(name, values.get(name, default)) for name, default in ROUGHNESS.items()}
     if "dh_rows" in rows:
         if parents is not None and tuple(parents) != tuple(range(-1, d - 1)):
-            raise InputError("dh_rows describe joints one after the other; give axes and points where links branch")
+            raise InputError("dh_rows describe serial chains only; give axes and points for trees with branches")
         frames = Frames(*dh_frames(rows["dh_rows"]))
     else:
         frames = frames_of_axes(rows["axes"], rows["points"], parents)
@@ -158,7 +158,7 @@ def _rows(name: str, value: Any, d: int) -> np.ndarray:
     try:
         return finite_array(name, value, (d, FIELDS[name]))
     except InputError:
-        raise InputError(f"{name}: expected {d} rows of {FIELDS[name]} finite numbers, one for each joint") from None
+        raise InputError(f"{name}: expected {d} rows of {FIELDS[name]} finite numbers, one per joint") from None
 
 
 def _positive(name: str, value: Any) -> float:
@@ -168,7 +168,7 @@ def _positive(name: str, value: Any) -> float:
 
 
 def _with_z_along(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Returns a rotation whose last column is the unit vector `axis`."""
+    """Returns a rotation with the unit vector `axis` as its last column."""
     x = np.cross(np.eye(3)[np.argmin(abs(axis))], axis)
     x = x / np.linalg.norm(x)
     return np.stack([x, np.cross(axis, x), axis], axis=1)

@@ -1,14 +1,14 @@
 """Levenberg-Marquardt on joint frames with variable projection, a few iterations in one program.
 
-For fixed frames, inertias and friction solve a linear problem and are eliminated:
+For fixed frames, a linear problem gives inertias and friction, which eliminates them:
 
     tau = Phi(frames) theta,   r = (1 - U Uᵀ) y,   J = -(1 - U Uᵀ) dPhi theta
 
-y holds the scaled torques, Phi is scaled likewise, and U spans its columns. J is Kaufman's (1975) simplification of
-Golub and Pereyra's derivative: its gradient Jᵀr is exact, and it needs no derivative of U. The columns are those of a
-minimal parametrisation (the parent link absorbs the others: Khalil and Dombre 2002, section 9.4), scaled to length
-one. The ridge, relative to these, fixes directions that the data leave undetermined. Only sums over samples are
-formed, so that a step takes milliseconds; `fit` solves the final linear problem to full precision.
+y has the scaled torques, Phi is scaled in the same way, and U spans its columns. J is Kaufman's (1975) simplification
+of Golub and Pereyra's derivative: its gradient Jᵀr is exact, and it needs no derivative of U. The columns belong to a
+minimal parametrisation, in which the parent link absorbs the other parameters (Khalil and Dombre 2002, section 9.4),
+and have length one. A ridge relative to them fixes undetermined directions. Only sums over samples are formed, so a
+step takes milliseconds. `fit` solves the final linear problem to full precision.
 """
 
 from collections.abc import Callable
@@ -27,13 +27,13 @@ from dln_jax.precision import compiled
 from dln_jax.types import JointKind, Vector
 
 LENGTH = 0.3
-"""Length in m that weighs as much as a radian in the damping."""
+"""Length in m that counts as one radian in the damping."""
 LARGEST_STEP = 0.6
-"""Largest step of a coordinate, in rad, and in units of `LENGTH` for positions: longer steps are scaled down."""
+"""Largest step of a coordinate, in rad or units of `LENGTH`; longer steps are scaled down."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e3
 """Initial, smallest and largest damping, relative to the mean diagonal of JᵀJ; a descent ends at the largest."""
 FEWER, MORE = 0.2, 5.0
-"""Factors on the damping after a step that lowers the loss, and after one that does not."""
+"""Factors on the damping after a successful step and after a failed one."""
 CHUNK = 10
 """Iterations per dispatch."""
 SETTLED = 1e-4
@@ -56,12 +56,12 @@ class Structure(NamedTuple):
     """Velocity scale of dry friction, 1/s or m/s."""
 
     def tree(self, frames: Frames, inertias: Any = None) -> Tree:
-        """The tree with these frames; gravity points against z."""
+        """Returns the tree with these frames; gravity points against z."""
         return Tree(self.parents, self.joints, *frames, None, inertias, None, (0.0, 0.0, -self.acceleration))
 
     @property
     def inertial(self) -> np.ndarray:
-        """Indices into a flat [d, 10] of the inertial parameters of the minimal parametrisation."""
+        """Returns the indices of the minimal inertial parameters in a flat [d, 10]."""
         kept = (OF_REVOLUTE if kind == "revolute" else OF_PRISMATIC for kind in self.joints)
         return np.concatenate([10 * link + own for link, own in enumerate(kept)])
 
@@ -91,7 +91,7 @@ class Projection(NamedTuple):
 
 
 def design(structure: Structure, frames: Frames, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d P"]:
-    """Phi of one state, unscaled."""
+    """Returns the unscaled Phi of one state."""
     d = q.shape[0]
     regressor = scanned_regressor(structure.tree(frames), q, qd, qdd)
     columns = [regressor.reshape(d, 10 * d)[:, structure.inertial], jnp.diag(qdd)]
@@ -101,7 +101,7 @@ def design(structure: Structure, frames: Frames, q: Vector, qd: Vector, qdd: Vec
 
 
 def inertias_of(structure: Structure, linear: Float[Array, " P"]) -> Float[Array, "d 10"]:
-    """Inertial parameters of the links, zero where the minimal parametrisation has none."""
+    """Returns the inertial parameters of the links, with zeros outside the minimal parametrisation."""
     d, places = len(structure.joints), structure.inertial
     return jnp.zeros(10 * d, linear.dtype).at[places].set(linear[: len(places)]).reshape(d, 10)
 
@@ -109,11 +109,11 @@ def inertias_of(structure: Structure, linear: Float[Array, " P"]) -> Float[Array
 def project(
     structure: Structure, frames: Frames, samples: Samples, unit: Float[Array, " d"], *, ridge: float
 ) -> Projection:
-    """Eliminates the linear parameters and returns the normal equations of a step of the frames.
+    """Eliminates the linear parameters and returns the normal equations for a step of the frames.
 
     Args:
         unit: scale of the joints' torques, N m or N.
-        ridge: added to the diagonal of the Gram matrix of the columns, scaled to length one.
+        ridge: added to the diagonal of the Gram matrix of the columns of length one.
     """
     *state, tau = samples
     equations = tau.size
@@ -121,7 +121,7 @@ def project(
     Phi, y = Phi.reshape(equations, -1), (tau / unit).ravel()
     gram = Phi.T @ Phi
     lengths = jnp.sqrt(jnp.diag(gram))
-    seen = lengths > 1e-9 * jnp.max(lengths)  # shorter columns are rounding, which scaling would amplify
+    seen = lengths > 1e-9 * jnp.max(lengths)  # shorter columns are rounding
     scale = jnp.where(seen, lengths, 1.0)
     both = seen[:, None] & seen
     gram = jnp.where(both, gram / (scale[:, None] * scale), 0.0) + jnp.diag(jnp.where(seen, ridge, 1.0))
@@ -163,7 +163,7 @@ Program = Callable[[Descent, Samples, Array], Descent]
 
 
 def make_program(structure: Structure, *, ridge: float) -> Program:
-    """Returns the program of a structure; it compiles once per number of samples."""
+    """Returns the program for a structure; it compiles once per number of samples."""
     places = free_directions(structure.parents, structure.joints)
     lengths = np.where(places % 6 < 3, 1.0, LENGTH)
     d = len(structure.joints)
@@ -198,10 +198,10 @@ def descend(
     iterations: int,
     expired: Callable[[], bool] = lambda: False,
 ) -> Descent:
-    """Iterates until the loss settles, no step descends, or the iterations or the time are used up."""
+    """Iterates until the loss settles, no step lowers it, or iterations or time run out."""
     samples, unit = jax.tree.map(jnp.asarray, (samples, unit))
     directions = len(free_directions(structure.parents, structure.joints))
-    # The first iteration only evaluates the frames: without a slope there is no step.
+    # The first iteration only evaluates the frames, since a zero slope gives no step.
     at = Projection(
         loss=jnp.asarray(jnp.inf),
         squares=jnp.zeros(len(structure.joints)),

@@ -2,9 +2,9 @@
 
 Descents end in a few recurring local minima. If several starts agree on the lowest, it is probably the global minimum.
 
-Two fitted trees are the same arm if their joint axes at q = 0 are the same, up to what torques cannot determine. The
-axes of one are moved onto those of the other by a rotation and a shift, with or without a mirror. A point may slide
-along its axis, axes of prismatic joints have directions only, and gravity, if any, is one more direction.
+Two fitted trees are the same arm if their joint axes at q = 0 agree, up to gauges that torques cannot determine. A
+rotation and a shift, with or without a mirror, align the two sets of axes. A point may slide along its axis, axes of
+prismatic joints have only a direction, and gravity, if any, is one more direction.
 """
 
 import functools
@@ -31,19 +31,19 @@ from dln_jax.learning.kinematics.projection import LENGTH, Descent, Program, Sam
 from dln_jax.types import JointVector, require_positive, require_seed
 
 WAVE = 8
-"""Starts between two tests of agreement. It does not depend on the number of threads, so neither do the results."""
+"""Starts between two tests of agreement; constant, so that results do not depend on the number of threads."""
 ALIKE = 0.02
-"""Largest relative difference of two losses that count as the same local minimum."""
+"""Largest relative difference of losses at the same local minimum."""
 SAME_ANGLE, SAME_LENGTH = np.radians(5.0), 0.03
-"""Largest angle and distance between the axes of two arms that count as the same, rad and m."""
+"""Largest angle and distance between axes of the same arm, rad and m."""
 SAME_ERROR = 0.1
-"""Largest relative difference of the validation errors of two descents that agree."""
+"""Largest relative difference of validation errors of agreeing descents."""
 TURNS = 8
-"""Initial angles of the comparison about an axis, for arms whose axes are parallel."""
+"""Initial angles of the alignment about an axis, for arms with parallel axes."""
 
 
 class Search(NamedTuple):
-    """Limits of the search; the first one that is reached ends it."""
+    """Limits of the search; the first one reached ends it."""
 
     starts: int = 64
     """Largest number of random starts."""
@@ -52,15 +52,15 @@ class Search(NamedTuple):
     iterations: int = 150
     """Largest number of iterations of a descent."""
     samples: int = 160
-    """Samples drawn from the data for the search; the best frames are refined on all."""
+    """Samples drawn for the search; the best frames are refined on all samples."""
     seconds: float = float("inf")
-    """Time limit of the search; then the best frames so far are taken. At least one wave of starts runs."""
+    """Time limit of the search, s; at least one wave of starts runs."""
     confirm: bool = True
-    """Whether to search until two descents end at the same arm, with the same validation error."""
+    """Search until two descents end at the same arm with the same validation error."""
     seed: int = 0
     threads: int = 2
     kinematic_prior: KinematicPrior | None = None
-    """Frames near which to start, for example from a drawing with link lengths and rough axes (default: anywhere)."""
+    """Frames near the starts, for example from a drawing with link lengths and rough axes (default: random starts)."""
 
 
 def search(
@@ -75,12 +75,12 @@ def search(
 ) -> tuple[list[Descent], int]:
     """Descends from random starts, and from moves of the best, until enough descents agree on the lowest loss.
 
-    Returns the final states of all descents, lowest loss first, and the number of random starts among them.
+    Returns the final states of all descents, lowest loss first, and the number of random starts.
 
     Args:
-        program: descent of the structure, from `compiled`.
+        program: from `make_program`.
         until: reading of `time.perf_counter` at the end of the search.
-        before: an earlier search, which another wave of starts continues.
+        before: result of an earlier search to continue.
 
     Raises:
         InputError: a setting out of range.
@@ -114,7 +114,7 @@ def search(
 
 
 def count_agreeing(descents: list[Descent]) -> int:
-    """Number of descents that ended at the lowest loss."""
+    """Counts the descents that ended at the lowest loss."""
     return sum(float(descent.at.loss) <= (1 + ALIKE) * float(descents[0].at.loss) for descent in descents)
 
 
@@ -147,12 +147,12 @@ class Difference(NamedTuple):
 
     @property
     def size(self) -> float:
-        """Sum of both, in units of the limits."""
+        """Sum of angle and length, in units of their limits."""
         return self.angle / SAME_ANGLE + self.length / SAME_LENGTH
 
     @property
     def same(self) -> bool:
-        """Whether they count as one arm."""
+        """Whether both arms count as the same."""
         return bool(self.angle <= SAME_ANGLE and self.length <= SAME_LENGTH)
 
 
@@ -160,7 +160,7 @@ class Twin(NamedTuple):
     """Another descent to the lowest loss, refined in the same way."""
 
     error: float
-    """Its validation error (without validation, training error) relative to that of the fit."""
+    """Its validation error (or training error) relative to the fit."""
     off: Difference
 
     @property
@@ -187,9 +187,10 @@ def difference(first: Frames, second: Frames, structure: Structure) -> Differenc
 
 
 def lines_of(frames: Frames, parents: Sequence[int], *, gravity: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Directions of the joint axes [d, 3], followed by that of gravity, and points on the axes [d, 3], at q = 0."""
+    """Returns directions of the joint axes, then of gravity [d or d + 1, 3], and points on the axes [d, 3], at q =
+    0."""
     d = len(parents)
-    # The ground comes last, where the index -1 points.
+    # The ground is last, at index -1.
     rotations, points = np.tile(np.eye(3), (d + 1, 1, 1)), np.zeros((d + 1, 3))
     for link, parent in enumerate(parents):
         rotations[link] = rotations[parent] @ frames.rotations[link]
@@ -218,6 +219,6 @@ def _aligned(
     starts = [Rotation.from_rotvec(2 * np.pi * k / TURNS * axes[-1]) * first for k in range(TURNS)]
     solutions = [least_squares(residual, np.append(start.as_rotvec(), np.zeros(3))) for start in starts]
     directions, across = errors(min(solutions, key=lambda solution: solution.cost).x)
-    # Angle between unit vectors from the length of the chord between them.
+    # Angle between unit vectors from the length of the chord.
     angle = 2 * np.arcsin(np.minimum(np.linalg.norm(directions, axis=1).max() / 2, 1.0))
     return Difference(float(angle), float(np.linalg.norm(across, axis=1).max(initial=0.0)))

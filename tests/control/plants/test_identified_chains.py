@@ -37,5 +37,5 @@ def test_noise_does_not_shrink_the_inertias_of_a_plant_with_a_weak_motor():
     np.testing.assert_allclose(found.dynamics.mass_matrix(jnp.zeros(2)), truth, rtol=0.15)
     # Torques of the wrong sign make every inertia negative.
     train, validation = (part._replace(tau=-part.tau) for part in (ready.train, ready.validation))
-    with one_line(r"positive definite at 0\.0% of the recording's positions"):
+    with one_line(r"positive definite at only 0\.0% of the recorded positions"):
         identified_chain(ready._replace(train=train, validation=validation), plant.layout.needs)

@@ -200,7 +200,7 @@ def test_a_planted_fault_is_found(clean, name):
 def test_a_clean_log_suits_its_robot(clean):
     examined = examine(from_arrays(clean), arm())
     on_tree = examined.on_tree
-    assert examined.findings == [] and "nothing was found" in report(examined, "log.npz")
+    assert examined.findings == [] and "no faults found" in report(examined, "log.npz")
     assert on_tree.scale == pytest.approx(np.ones(3), rel=0.1)
     assert on_tree.gravity == pytest.approx([0, 0, -9.81], abs=0.3)
     assert abs(examined.torques.likely_delay) < 0.2
@@ -359,7 +359,7 @@ def test_torques_without_gravity_are_named_and_fitted_so():
     robot = planar(UPRIGHT)
     data = from_arrays(log(torques(planar((0.0, 0.0, 0.0)), (0.1, 0.1))))
     known = log_of(data, "log.npz", robot=robot, check=True)
-    assert any("tau holds no gravity" in line for line in known.remarks)
+    assert any("tau does not include gravity" in line for line in known.remarks)
     assert not any("clock" in line for line in known.remarks) and not any("gravity" in fault for fault in known.faults)
     tree = known.robot.tree
     assert not np.any(tree.gravity) and np.array_equal(tree.inertias, robot.tree.inertias)

@@ -200,7 +200,7 @@ def test_bad_input_is_one_line(task, candidates):
         "half the sampling rate": lambda: require_sampling(period=2.0, harmonics=10, rate=10.0),
         "force by": lambda: random_designs(impossible, 1),
         "choose from": lambda: design_set(task, candidates, criterion="best"),
-        "8 starts are fewer": lambda: design_set(task, candidates, trajectories=8),
+        "8 starts are too few": lambda: design_set(task, candidates, trajectories=8),
     }.items():
         with one_line(message):
             call()

@@ -49,7 +49,7 @@ def test_what_is_no_kinematic_prior_is_refused():
         ({**axes, "points": [[0, 0]]}, None, "points: expected 3 rows of 3"),
         ({**axes, "axes": [[0, 0, 1], [0, 0, 0], [1, 0, 0]]}, None, "joint 2 has an axis of length zero"),
         ({**axes, "length": -1}, None, "length is -1"),
-        ({"dh_rows": np.zeros((3, 4)).tolist()}, BRANCHED, "one after the other"),
+        ({"dh_rows": np.zeros((3, 4)).tolist()}, BRANCHED, "serial chains only"),
     ]:
         with one_line(message):
             kinematic_prior_from_json(values, 3, parents)
