@@ -163,8 +163,6 @@ def run_fresh():
 def test_a_python_block_runs_in_a_fresh_interpreter_and_says_something(
     block, workplace, run_fresh, tmp_path, pytestconfig
 ):
-    if "import casadi" in block.text:
-        pytest.importorskip("casadi", reason="the functions are compared in CasADi, of the extra [test]")
     # On the first line, so that tracebacks have the page's numbers of lines.
     (tmp_path / "block.py").write_text(("" if pytestconfig.getoption("--optimised") else QUICKLY) + block.text)
     (result,) = run_fresh(tmp_path, Program(tmp_path / "block.py", folder=workplace, environment=dict(os.environ)))

@@ -3,12 +3,9 @@
 import numpy as np
 import pytest
 from calls import assert_refused, exit_status
+from made_bags import state, write_bag
 
 from dln_jax.commands import check_data
-
-pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
-pytest.importorskip("rosbags", reason="rosbags reads bags; it is in the extra [bag]")
-from made_bags import state, write_bag
 
 URDF = """<robot name="arm"><link name="base"/>
 <link name="shoulder"><inertial><origin xyz="0.2 0.02 0"/><mass value="1"/>

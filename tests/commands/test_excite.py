@@ -9,9 +9,6 @@ from dln_jax.commands import excite
 from dln_jax.data import schema
 from dln_jax.identification.excitation.limits import limits_of_robot
 
-pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
-
-
 URDF = """<robot name="arm"><link name="base"/>
 <link name="one"><inertial><origin xyz="0.2 0.02 0.05"/><mass value="1.5"/>
 <inertia ixx="0.03" iyy="0.04" izz="0.02" ixy="0.004" ixz="-0.002" iyz="0.001"/></inertial></link>

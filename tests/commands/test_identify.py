@@ -14,7 +14,6 @@ from dln_jax.data.log import log_of, split_log
 from dln_jax.export.c.source import export_c
 from dln_jax.export.functions import functions_of_run
 
-pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 LOG = "--robot arm.urdf --data log.npz"
 QUICK = "--no-figures --no-uncertainty"
 

@@ -15,7 +15,6 @@ from dln_jax.learning.linear import parameters_of
 from dln_jax.learning.shooting import motion
 from dln_jax.models.trees import make_rigid_tree
 
-pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 URDF = """<robot name="pendulum"><link name="base"/><link name="rod"><inertial><origin xyz="0 0 -0.2"/><mass value="1"/>
 <inertia ixx="0.02" iyy="0.02" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
 <joint name="hinge" type="continuous"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/></joint></robot>"""

@@ -14,7 +14,6 @@ from dln_jax.export.c.source import export_c
 from dln_jax.export.functions import functions_of_run
 from dln_jax.models.trees import make_rigid_tree
 
-pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 MJCF = """<mujoco><worldbody>
 <body name="upper" pos="0.1 0 0.2"><joint name="shoulder" axis="0 0.6 0.8" armature="0.1"/>
 <inertial pos="0.1 0.05 0.2" mass="2" diaginertia="0.03 0.04 0.02"/>

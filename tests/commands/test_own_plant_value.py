@@ -19,7 +19,6 @@ from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.zoo.run import load, save
 from dln_jax.zoo.value_functions import ValueRun, plant_of_model
 
-pytest.importorskip("mujoco", reason="MuJoCo reads the files; it is in the extra [robot]")
 ROD = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" damping="0.05"/>
 <inertial mass="1" pos="0 0 0.5" diaginertia="0.08333 0.08333 0.001"/></body></worldbody>
 <actuator><motor joint="hinge" ctrlrange="-2.5 2.5" ctrllimited="true"/></actuator></mujoco>"""

@@ -4,7 +4,6 @@ from functools import partial
 
 import jax
 import numpy as np
-import pytest
 from calls import assert_refused, command, exit_status, json_of, refused
 
 from dln_jax import InputError, build, describe
@@ -25,7 +24,6 @@ def test_a_run_stores_data_numbers_and_pictures(tmp_path, monkeypatch):
     # A known model needs no exploration by the laws of learned ones, which take a minute to compile.
     monkeypatch.setattr(f"{PLACE}.Exploration", partial(Exploration, surplus=()))
     monkeypatch.setattr(f"{PLACE}.tune", partial(tune, sets=16))
-    pytest.importorskip("mujoco", reason="MuJoCo simulates the plant; it is in the extra [robot]")
     few = "--plant cart-pole --model known --seconds-of-data 12 --starts 2 --estimator differences --out"
     command(swing_up, few, tmp_path / "run")
     found = json_of(tmp_path / "run/metrics.json")
@@ -91,7 +89,6 @@ def test_a_law_that_does_not_carry_over_to_the_plant_is_refused_with_the_reason(
 
 def two_links(folder):
     """The file of two rods without a limit of their motors."""
-    pytest.importorskip("mujoco", reason="MuJoCo simulates the plant; it is in the extra [robot]")
     (folder / "mine.xml").write_text(
         """<mujoco><worldbody><body><joint name="shoulder" axis="0 1 0"/>
         <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".01" mass=".2"/>

@@ -35,7 +35,6 @@ def workplace(folder):
 
 def chosen(folder, **more):
     """The fit of a selection with the robot's file."""
-    pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
     log = read_log("rigid.npz", robot="arm.xml")
     return Automatic().fit(log, split_log(log), Context(folder=folder, **more))
 
@@ -88,7 +87,6 @@ def test_a_kinematic_prior_and_parents_reach_the_search(workplace, capsys, monke
 
 
 def test_mistakes_are_one_line(workplace, capsys):
-    pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
     (workplace / "wrong.json").write_text('{"colour": "red"}')
     rows = {
         "--width 4": "--width is an option of networks",

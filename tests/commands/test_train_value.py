@@ -8,7 +8,6 @@ from calls import assert_refused, command, json_of
 from dln_jax.commands import train_value
 from dln_jax.zoo.run import load
 
-pytest.importorskip("mujoco", reason="MuJoCo reads the files; it is in the extra [robot]")
 TINY = "--method residual --width 3 --depth 1 --iterations 1 --starts 3"
 
 

@@ -4,8 +4,8 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
-import pytest
 from calls import one_line
 
 from dln_jax import tree_system
@@ -18,7 +18,6 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees.description import make_tree
 from dln_jax.mechanics.trees.inertia import inertial_parameters
 
-mujoco = pytest.importorskip("mujoco", reason="MuJoCo simulates the plant; it is in the extra [robot]")
 B = np.array([[1.0], [0.0]])
 START = np.array([0.1, 0.5, 0.0, -0.3])
 FREE = np.full((2, 2), [-np.inf, np.inf])

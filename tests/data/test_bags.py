@@ -6,12 +6,10 @@ import sys
 import numpy as np
 import pytest
 from calls import one_line
+from made_bags import state, write_bag
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dln_jax.data import schema
-
-pytest.importorskip("rosbags", reason="rosbags reads bags; it is in the extra [bag]")
-from made_bags import state, write_bag
 
 NAMES = ["elbow", "shoulder"]
 T = np.arange(40) / 100

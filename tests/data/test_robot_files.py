@@ -11,7 +11,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from dln_jax import dynamics, read_robot, tree_system
 from dln_jax.data.robot_files import mjcf, write_robot
 
-pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 INERTIAL = """<inertial><origin xyz="0.1 -0.05 0.2" rpy="0.3 -0.2 0.5"/><mass value="{mass}"/>
 <inertia ixx="0.03" iyy="0.04" izz="0.02" ixy="0.004" ixz="-0.002" iyz="0.001"/></inertial>"""
 URDF = f"""<robot name="arm"><!-- kept --><link name="base">{INERTIAL.format(mass=9)}</link>

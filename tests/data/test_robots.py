@@ -4,6 +4,7 @@ import os
 import textwrap
 
 import jax
+import mujoco
 import numpy as np
 import pytest
 from calls import one_line
@@ -13,7 +14,6 @@ from dln_jax import dynamics, read_robot, tree_system
 from dln_jax.mechanics.trees.frames import world_frames
 from dln_jax.mechanics.trees.inertia import pseudo_inertia
 
-mujoco = pytest.importorskip("mujoco", reason="MuJoCo is the reference; it is in the extra [robot]")
 LINK = """
 <link name="{0}">
   <inertial>

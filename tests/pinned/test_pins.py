@@ -7,7 +7,6 @@ from pathlib import Path
 import lines
 import pytest
 
-pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
 PINS = Path(__file__).with_name("pins.json")
 STORED = json.loads(PINS.read_text()) if PINS.exists() else {}
 CLOSE = 1e-9

@@ -7,7 +7,6 @@ from dln_jax.commands import sweep
 from dln_jax.commands.sweeps.executors import Requeued
 from dln_jax.commands.sweeps.jobs import Job, run_job
 
-pytest.importorskip("submitit", reason="Slurm sweeps are submitted with submitit, of the extra [sweep]")
 PROGRAMS = {
     "sbatch": 'cat "$1" >> FOLDER/scripts; echo "Submitted batch job 7"',
     "sacct": 'echo "JobID|State|NodeList"; cat FOLDER/states',

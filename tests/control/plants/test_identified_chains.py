@@ -1,6 +1,7 @@
 """A chain whose motor lifts a fifth of the weight is identified from short motions about hanging."""
 
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from calls import one_line
@@ -10,7 +11,6 @@ from dln_jax.control.plants.exploring import Exploration, explore
 from dln_jax.control.plants.mujoco_plants import mujoco_plant
 from dln_jax.learning.recordings import identified_chain, prepare
 
-mujoco = pytest.importorskip("mujoco", reason="MuJoCo simulates the plant; it is in the extra [robot]")
 BLIND = Exploration(seconds=12.0, blind=(0.3, 0.4, 0.5, 0.6), surplus=())
 
 

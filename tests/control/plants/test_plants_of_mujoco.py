@@ -14,7 +14,6 @@ from dln_jax.control.state_space import field_of, integrated
 from dln_jax.data.robots import read_robot
 from dln_jax.mechanics.equations import dynamics
 
-pytest.importorskip("mujoco", reason="MuJoCo simulates the plants; it is in the extra [robot]")
 ROD = '<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".01" mass=".2" contype="0" conaffinity="0"/>'
 MOTOR = '<motor joint="rail" gear="2" ctrllimited="true" ctrlrange="-5 5"/>'
 SLIDE = 'type="slide" axis="1 0 0" range="-.5 .5" limited="true"'

@@ -5,6 +5,7 @@ A page of the documentation solves a swing-up with them, which runs in the tests
 
 import ctypes
 
+import casadi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +20,6 @@ from dln_jax.export.c.source import export_c
 from dln_jax.export.functions import functions_of_system
 from dln_jax.scenes.pendulums import pendulum
 
-casadi = pytest.importorskip("casadi", reason="the functions are compared in CasADi, of the extra [test]")
 # What a loop leaves of each turn is kept even if nothing reads it.
 FLAGS = ("-std=c99", "-pedantic", *STRICT, "-Wno-unused-but-set-variable")
 BOUND = 1e-12

@@ -131,7 +131,7 @@ ARM = f"<mujoco><worldbody>{''.join(map(BODY.format, ('0 1 0', '1 0 0', '0 1 0')
 
 def test_step_of_mjx(tmp_path):
     mjx = pytest.importorskip("mujoco.mjx", reason="mjx is the package mujoco-mjx")
-    model = mjx.put_model(pytest.importorskip("mujoco").MjModel.from_xml_string(ARM))
+    model = mjx.put_model(mujoco.MjModel.from_xml_string(ARM))
     data = mjx.make_data(model)
 
     def step(q, qd, tau):

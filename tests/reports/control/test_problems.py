@@ -21,7 +21,8 @@ def test_cart_pole_is_that_of_the_scenes():
 
 
 def test_casadi_has_the_same_formulas():
-    ca = pytest.importorskip("casadi", reason="the formulas are compared in CasADi, of the extra [test]")
+    import casadi as ca
+
     random = np.random.default_rng(0)
     for problem in problems.problems():
         x, u = random.normal(size=len(problem.x0)), random.normal(size=len(problem.limit))
@@ -34,8 +35,6 @@ def test_casadi_has_the_same_formulas():
 
 @pytest.mark.parametrize("name", plants.PLANTS)
 def test_plant_starts_near_hanging_and_stays_there(name):
-    if "gymnasium" in name:
-        pytest.importorskip("gymnasium", reason="Gymnasium simulates the plant; it is in the extra [test]")
     plant, seen = plants.PLANTS[name](0, 1), []
     plant.reset()
     for _ in range(100):

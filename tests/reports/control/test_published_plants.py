@@ -37,7 +37,6 @@ def test_the_cart_pole_as_printed():
 
 @pytest.mark.parametrize("name", PLANTS)
 def test_files_have_the_published_dynamics(name):
-    pytest.importorskip("mujoco", reason="MuJoCo reads the files; it is in the extra [robot]")
     run, known, _ = plants.of_file(FOLDER / f"{name}.xml")
     of_file = plant_of_model(run.model, run.parameters, plants.problem_of(run, known))
     x, u = jnp.array([0.3, 2.0, -1.5, 4.0])[-2 * len(known.joints) :], 0.7 * known.limits.control[:, 1]

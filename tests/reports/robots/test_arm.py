@@ -12,7 +12,6 @@ from scripts.reports.robots.known_kinematics import summary
 
 @pytest.fixture(scope="module")
 def short():
-    pytest.importorskip("mujoco", reason="MuJoCo reads the robot files; it is in the extra [robot]")
     wanted = motion(np.random.default_rng(0))
     return Motion(*(each[:800] for each in wanted))
 

@@ -68,7 +68,6 @@ def test_textbook_rates_are_those_of_the_scene():
 
 @needs_compiler
 def test_casadi_computes_the_same_numbers_by_its_own_derivatives(tmp_path):
-    pytest.importorskip("casadi", reason="the functions are compared in CasADi, of the extra [test]")
     ours, rival = tmp_path / "ours", tmp_path / "casadi"
     kinds = exported_c.casadi_step(rival, shared=True)
     export_c({STEP: exported_c.our_steps()["closed-form"]}, ours, finite=True)
