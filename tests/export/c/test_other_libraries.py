@@ -5,6 +5,7 @@ import equinox
 import equinox.internal
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import optimistix
 import pytest
