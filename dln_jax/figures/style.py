@@ -183,7 +183,7 @@ def write_gif(
     palette.putpalette(entries.ravel().tolist())
     images = [image.convert("RGB").quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     content, duration = io.BytesIO(), round(1000 / frames_per_second)
-    images[0].save(content, "gif", save_all=True, append_images=images[1:], duration=duration, loop=0)
+    images[0].save(content, "gif", save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=True)
     write_bytes(path, content.getvalue())
     if ffmpeg := shutil.which("ffmpeg"):
         # Players expect even sizes and this format of pixels. If ffmpeg fails, it says so, and there is no MP4.
