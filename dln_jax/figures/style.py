@@ -1,4 +1,4 @@
-"""Common style of all figures: width, text sizes, a light grid, and one colour per model; and animated GIFs.
+"""Common style of all figures: width, text sizes, a light grid, and one colour per model; and films.
 
 Matplotlib's global state is neither read nor set: figures are made without pyplot, and settings that Matplotlib would
 apply later, when it makes ticks, are set on every axis.

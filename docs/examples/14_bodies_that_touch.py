@@ -71,7 +71,8 @@ for axes, k in zip(panels.ravel(), np.linspace(0, STEPS, 4).astype(int), strict=
     axes.add_collection(
         PolyCollection(every[k][mesh.elements], facecolor=style.BLUE, edgecolor=style.BLUE, linewidth=1.0)
     )
-    axes.set(xlim=(-0.55, 0.75), ylim=(-0.06, 0.52), aspect="equal", title=f"{DT * k:.2f} s")
+    axes.set(xlim=(-0.55, 0.75), ylim=(-0.06, 0.52), aspect="equal")
+    style.title(axes, f"{DT * k:.2f} s")
     axes.set_axis_off()
-    axes.plot([0.45, 0.65], [0.42, 0.42], color="0.2", linewidth=2)
-    axes.text(0.55, 0.44, "0.2 m", ha="center", fontsize=style.SMALL)
+    axes.plot([0.5, 0.7], [0.2, 0.2], color="0.2", linewidth=2)
+    axes.text(0.6, 0.22, "0.2 m", ha="center", fontsize=style.SMALL)
