@@ -245,7 +245,7 @@ def sweep_figure(results: Mapping[str, Any], at_once: int | None) -> Figure | No
         return shortened(values.get(name, ""))
 
     kinds, forms = (list(dict.fromkeys(look(point[0], name) for point in points)) for name in (colour, marker))
-    colours = dict(zip(kinds, colormaps["viridis"](np.linspace(0, 0.95, len(kinds))), strict=True))
+    colours = dict(zip(kinds, colormaps["viridis"](np.linspace(0, 0.85, len(kinds))), strict=True))
     markers = {form: style.MARKERS[number % len(style.MARKERS)] for number, form in enumerate(forms)}
 
     named = len(results["groups"]) <= MOST_NAMED
