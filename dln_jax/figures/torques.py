@@ -80,8 +80,8 @@ def force_decomposition(
     """
     samples, x, starts, breaks, (of_data, of_model), time = _on_one_axis(data, MOST_MOTIONS)
     joints = min(data.degrees_of_freedom, MOST_JOINTS)
-    modelled, given = _parts(predicted, samples, joints), _parts(data._asdict(), samples, joints)
-    errors = {key: modelled[key] - given[key] for key in given if key in modelled}
+    modelled, data_parts = _parts(predicted, samples, joints), _parts(data._asdict(), samples, joints)
+    errors = {key: modelled[key] - data_parts[key] for key in data_parts if key in modelled}
     largest = np.max(np.abs(list(errors.values())), axis=(0, 1))
     factor, prefix = style.prefixed(float(largest.max()), "")
     rows = [(key, is_error) for key in modelled for is_error in (False, True) if not is_error or key in errors]
@@ -96,11 +96,11 @@ def force_decomposition(
                 limit = 1.15 * largest[joint] / factor or 1.0
                 axis.set_ylim(-limit, limit)
             else:
-                if key in given:
+                if key in data_parts:
                     look = {"color": "black", "linewidth": 2.0, "markersize": 4}
                     # Parts are not measured: a file that has them is of a simulation.
-                    label = style.TRUTH if len(given) > 1 else "measured"
-                    axis.plot(x, given[key][:, joint], of_data, label=label, **look)
+                    label = style.TRUTH if len(data_parts) > 1 else "measured"
+                    axis.plot(x, data_parts[key][:, joint], of_data, label=label, **look)
                 axis.plot(x, modelled[key][:, joint], of_model, color=shade, linewidth=1.3, label=model + note)
                 if np.ptp(axis.get_ylim()) < ROUNDING * np.ptp(modelled["tau"][:, joint]):  # a part that is zero
                     axis.set_ylim(-1.0, 1.0)
