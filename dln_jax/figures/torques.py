@@ -164,8 +164,8 @@ def torque_bands(
             half = half_width(LEVEL) * std[:, joint]
             text += f": {100 * np.mean(np.abs(error[:, joint]) <= half):.1f} % of samples within the band"
             for side, middle, scale in ((axis, mean, 1.0), (below, 0.0, factor)):
-                edges = [(middle + sign * half[samples]) / scale for sign in (-1, 1)]
-                side.fill_between(x, *edges, color=shade, alpha=0.25, linewidth=0, label="95 % band")
+                low, high = ((middle + sign * half[samples]) / scale for sign in (-1, 1))
+                side.fill_between(x, low, high, color=shade, alpha=0.25, linewidth=0, label="95 % band")
             if flags[samples].any():
                 places = x[flags[samples]]
                 look = {"color": style.VERMILLION, "markersize": 5, "label": "out of distribution"}
