@@ -1,8 +1,8 @@
 """Simulate a soft body by implicit time steps: a cantilever, a twisted bar, a sliding block, a falling body, a crawler.
 
-Prints the speed and how well the steps were solved, and writes a run folder: motion.gif, energy.png (energies against
-time, which show what the implicit step damps), moments.png, metrics.json, report.json and config.json. Bodies have
-1000 kg/m³; in the plane they are 1 m thick.
+Prints the speed and how well the steps were solved, and writes a run folder: motion.gif (and motion.mp4 if ffmpeg is
+installed), energy.png (energies against time, which show what the implicit step damps), moments.png, metrics.json,
+report.json and config.json. Bodies have 1000 kg/m³; in the plane they are 1 m thick.
 
 Your own mesh: --mesh FILE for the scenes beam and drop, with the last axis up. Formats: .msh of Gmsh (2.2 and 4.1)
 and, with the extra [mesh], .vtk, .vtu, .obj and TetGen's .ele. Tetrahedra form a body in space, triangles with constant

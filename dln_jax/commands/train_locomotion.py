@@ -5,8 +5,8 @@ lengths the mean x of the vertices travels before the creature falls, if it does
 own frame and a clock, and changes the actuation of the muscles, 0.25 to 1 of their rest length, by at most 0.3 a step.
 Episodes may start perturbed, on slopes or rough ground, and be disturbed by pushes. Then the policy is selected by 16
 walks of five episodes on the steepest slopes, and judged by 100 others of 2,000 steps. A run folder gets config.json,
-metrics.json, the model of the best seed, a figure of the learning, and a GIF of the gait. evaluate_locomotion judges
-the policy on other ground.
+metrics.json, the model of the best seed, a figure of the learning, and a GIF of the gait (also an MP4 if ffmpeg is
+installed). evaluate_locomotion judges the policy on other ground.
 """
 
 import math

@@ -1,11 +1,14 @@
-"""Common style of all figures: width, text sizes, a light grid, and one colour per model; and animated GIFs.
+"""Common style of all figures: width, text sizes, a light grid, and one colour per model; and films.
 
 Matplotlib's global state is neither read nor set: figures are made without pyplot, and settings that Matplotlib would
 apply later, when it makes ticks, are set on every axis.
 """
 
 import io
+import shutil
+import subprocess
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -18,7 +21,7 @@ from matplotlib.legend import Legend
 from PIL import Image
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.files import write_bytes
+from dln_jax.files import write_bytes, writing
 
 WIDTH, DPI = 7.2, 150
 """Inches, and pixels per inch: 1,080 pixels, the width of a page."""
@@ -40,16 +43,16 @@ MODELS: dict[str, str] = {
     "black-box-hnn": ORANGE,
     "trigonometric": GREEN,
     "learned-tree": "#117733",
-    "identified-arm": GREEN,
+    "planar-chain": GREEN,
+    "rigid-tree": GREEN,
     "feed-forward": PURPLE,
     "separable-hnn": "#B2182B",
     "pairwise-hnn": "#882255",
     "polynomial-hamiltonian": "#44AA99",
+    "helmholtz-hnn": "#AA4499",
     "phase-network": "#7E57A6",
     "differential-network": "#332288",
-    **dict.fromkeys((TRUTH, "plant", "exact-model"), "black"),
-    "feedback-alone": REFERENCE,
-    "published": REFERENCE,
+    TRUTH: "black",
 }
 """Colours of models: Lagrangians are blue, Hamiltonians warm, linear models and trees green, others purple."""
 UNKNOWN = "#555555"
@@ -157,6 +160,8 @@ def write_gif(
 ) -> None:
     """Writes a GIF by calling `show(frame)` for every frame, with the title and, unless t is `None`, the time in s.
 
+    If `ffmpeg` is installed, an MP4 of the same name is written beside it.
+
     Raises:
         InputError: the file cannot be written. It is written completely or not at all.
     """
@@ -174,9 +179,15 @@ def write_gif(
     some = [image.convert("RGB") for image in images[:: max(1, len(images) // 6)]]
     palette = Image.fromarray(np.concatenate([np.asarray(image) for image in some])).quantize(COLOURS)
     entries = np.reshape(palette.getpalette(), (-1, 3))
-    entries[entries.sum(axis=1) >= 750] = 255  # the background is white
+    entries[entries.sum(axis=1) >= 735] = 255  # the background is white
     palette.putpalette(entries.ravel().tolist())
     images = [image.convert("RGB").quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     content, duration = io.BytesIO(), round(1000 / frames_per_second)
-    images[0].save(content, "gif", save_all=True, append_images=images[1:], duration=duration, loop=0)
+    images[0].save(content, "gif", save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=True)
     write_bytes(path, content.getvalue())
+    if ffmpeg := shutil.which("ffmpeg"):
+        # Players expect even sizes and this format of pixels. If ffmpeg fails, it says so, and there is no MP4.
+        options = "-y -v error -r {} -i - -vf pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white -pix_fmt yuv420p -f mp4"
+        with suppress(subprocess.CalledProcessError), writing(path.with_suffix(".mp4")) as partial:
+            command = [ffmpeg, *options.format(frames_per_second).split(), partial]
+            subprocess.run(command, input=content.getvalue(), check=True)

@@ -1,7 +1,6 @@
 """Figures of torques: parts and errors, bands, torques and friction by joint, and motions that excite them."""
 
 import itertools
-import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
@@ -15,49 +14,77 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.figures import style
 from dln_jax.metrics.errors import LEVEL, LEVELS, coverage, half_width
 from dln_jax.metrics.motions import Motion, valid_prediction_times
+from dln_jax.types import JointKind
 
-PARTS = {"tau": "torque", "tau_inertial": "inertial", "tau_coriolis": "Coriolis", "tau_gravity": "gravity"}
+PARTS = {
+    "tau": "torque",
+    "tau_inertial": "inertial",
+    "tau_coriolis": "Coriolis",
+    "tau_gravity": "gravity",
+    "tau_friction": "friction",
+}
 MOST_JOINTS, MOST_MOTIONS, MOST_PATHS = 4, 6, 24
 """Largest numbers of joints, motions and paths shown."""
-MOST_COLUMNS, MOST_EXCITED = 4, 8
+MOST_COLUMNS, MOST_EXCITED = 3, 8
 """Largest numbers of columns in a figure of friction, and of joints in one of excitation motions."""
-MOST_BANDS, MOST_BAND_SAMPLES = 7, 400
-"""Largest numbers of joints and samples shown with bands."""
+MOST_BANDS = 40
+"""Largest number of motions shown with bands."""
+SHOWN = 0.995
+"""Quantile of the absolute errors that sets the range of their panel."""
 MOST_SAMPLES = 4000
 """Largest number of samples drawn per joint."""
-ROUNDING = 1e-9
+ROUNDING = 1e-5
 """Parts that vary less than this share of the torque are drawn as zero."""
 HIGH, LOW = 0.8, 0.36
 """Heights of a panel of forces and of a panel of errors, inches."""
 QUANTITIES: dict[Literal["q", "qd", "tau"], str] = {"q": "position", "qd": "velocity", "tau": "force"}
 
 
+def _on_one_axis(data: Trajectories, most: int) -> tuple[Any, ...]:
+    """Samples of the first motions, their places on one axis, where motions start and break, formats and a label.
+
+    Motions are joined in time, at the median spacing of their samples; isolated states are numbered and drawn as
+    points. The formats are those of data and of a model.
+    """
+    samples = np.flatnonzero(np.isin(data.trajectory, np.unique(data.trajectory)[:most]))[:MOST_SAMPLES]
+    starts = np.flatnonzero(np.diff(data.trajectory[samples], prepend=-1))
+    x, formats, label = np.arange(len(samples), dtype=float), ("o", "."), "test state"
+    if len(samples) > 2 * len(starts):
+        formats, label = ("-", "--"), "time in the test, s"
+        steps = np.diff(data.t[samples], prepend=data.t[samples[0]])
+        steps[starts[1:]] = np.median(np.delete(steps, starts))
+        x = np.cumsum(steps)
+    return samples, x, starts, (x[starts[1:] - 1] + x[starts[1:]]) / 2, formats, label
+
+
+def _parts(values: Mapping[str, Any], samples: np.ndarray, joints: int) -> dict[str, np.ndarray]:
+    """The torque and its parts, as far as they are known; friction is the rest, if there is any."""
+    parts = {key: values[key][samples, :joints] for key in PARTS if values.get(key) is not None}
+    if len(parts) == len(PARTS) - 1:
+        friction = 2 * parts["tau"] - sum(parts.values())
+        if np.ptp(friction) > ROUNDING * np.ptp(parts["tau"]):
+            parts["tau_friction"] = friction
+    return parts
+
+
 def force_decomposition(
     data: Trajectories, predicted: dict[str, np.ndarray], *, model: str = "model", note: str = ""
 ) -> Figure:
-    """Torque and its parts over the first test motions, one column per joint: truth and model, with the error below.
+    """Torque and its parts over the first test motions, one column per joint: data and model, with the error below.
 
-    All errors share one scale. Motions are joined in time; isolated states are compared point by point.
+    The parts add up to the torque; the errors of a joint share one scale. Motions are joined in time; isolated states
+    are compared point by point.
 
     `data` is the test set, `predicted` [N, d] by the keys of `PARTS`; the model's name sets the colour, and
     the legend adds a note to it.
     """
-    samples = np.flatnonzero(np.isin(data.trajectory, np.unique(data.trajectory)[:MOST_MOTIONS]))
-    trajectory, joints = data.trajectory[samples], min(data.degrees_of_freedom, MOST_JOINTS)
-    starts = np.flatnonzero(np.diff(trajectory, prepend=-1))
-    moving = len(samples) > 2 * len(starts)
-    x = np.arange(len(samples), dtype=float)
-    if moving:  # motions are joined at the median spacing of their samples
-        steps = np.diff(data.t[samples], prepend=data.t[samples[0]])
-        steps[starts[1:]] = np.median(np.delete(steps, starts))
-        x = np.cumsum(steps)
-    of_truth, of_model, of_errors = ("-", "--", "-") if moving else ("o", ".-", ".")
-    modelled = {key: predicted[key][samples, :joints] for key in PARTS}
-    truths = {key: truth[samples, :joints] for key in PARTS if (truth := getattr(data, key)) is not None}
-    errors = {key: modelled[key] - truth for key, truth in truths.items()}
-    largest = float(np.max(np.abs(list(errors.values())), initial=0.0))
-    factor, prefix = style.prefixed(largest, "")
-    rows = [(key, is_error) for key in PARTS for is_error in (False, True) if not is_error or key in errors]
+    samples, x, starts, breaks, (of_data, of_model), time = _on_one_axis(data, MOST_MOTIONS)
+    joints = min(data.degrees_of_freedom, MOST_JOINTS)
+    modelled, data_parts = _parts(predicted, samples, joints), _parts(data._asdict(), samples, joints)
+    errors = {key: modelled[key] - data_parts[key] for key in data_parts if key in modelled}
+    largest = np.max(np.abs(list(errors.values())), axis=(0, 1))
+    factor, prefix = style.prefixed(float(largest.max()), "")
+    rows = [(key, is_error) for key in modelled for is_error in (False, True) if not is_error or key in errors]
     heights = [LOW if is_error else HIGH for _, is_error in rows]
     figure, axes = style.figure(len(rows), joints, height=sum(heights) + 0.9, sharex=True, height_ratios=heights)
     figure.get_layout_engine().set(h_pad=0.02, hspace=0.0)  # type: ignore[union-attr]
@@ -65,111 +92,105 @@ def force_decomposition(
     for line, (key, is_error) in zip(axes, rows, strict=True):
         for joint, axis in enumerate(line):
             if is_error:
-                axis.plot(x, errors[key][:, joint] / factor, of_errors, color=shade, linewidth=0.9)
-                axis.set_ylim(-1.15 * largest / factor, 1.15 * largest / factor)
+                axis.plot(x, errors[key][:, joint] / factor, of_model[:1], color=shade, linewidth=0.9)
+                limit = 1.15 * largest[joint] / factor or 1.0
+                axis.set_ylim(-limit, limit)
             else:
-                if key in truths:
-                    truth = truths[key][:, joint]
-                    axis.plot(x, truth, of_truth, color="black", linewidth=2.0, markersize=4, label="truth")
+                if key in data_parts:
+                    look = {"color": "black", "linewidth": 2.0, "markersize": 4}
+                    # Parts are not measured: a file that has them is of a simulation.
+                    label = style.TRUTH if len(data_parts) > 1 else "measured"
+                    axis.plot(x, data_parts[key][:, joint], of_data, label=label, **look)
                 axis.plot(x, modelled[key][:, joint], of_model, color=shade, linewidth=1.3, label=model + note)
                 if np.ptp(axis.get_ylim()) < ROUNDING * np.ptp(modelled["tau"][:, joint]):  # a part that is zero
                     axis.set_ylim(-1.0, 1.0)
             axis.margins(x=0.01)
             axis.tick_params(axis="x", bottom=line is axes[-1])
-            style.separate(axis, (x[starts[1:] - 1] + x[starts[1:]]) / 2)
+            style.separate(axis, breaks)
         line[0].set_ylabel(f"error,\n{prefix}{units[0]}" if is_error else f"{PARTS[key]},\n{units[0]}")
-    time = "time, s (test motions in turn)" if joints < 3 and len(starts) > 1 else "time, s"
     for joint, (top, bottom) in enumerate(zip(axes[0], axes[-1], strict=True)):
         unit = "" if units[joint] == units[0] else f" ({units[joint]})"
         style.title(top, f"joint {joint + 1}{unit}", pad=16)
         for start, end in itertools.pairwise([*starts, len(x)]):
-            name = str(data.label[trajectory[start]])
+            name = str(data.label[data.trajectory[samples[start]]])
             place, size = ((x[start] + x[end - 1]) / 2, 1.04), style.SMALL if len(name) < 4 else 6.5
             top.annotate(name, place, xycoords=("data", "axes fraction"), ha="center", fontsize=size, color="0.35")
-        bottom.set_xlabel(time if moving else "test state")
+        bottom.set_xlabel(time)
     figure.align_ylabels(axes[:, 0])
     style.legend_beside(figure, axes[0, 0], columns=2)
-    return figure
-
-
-def torque_by_joint(
-    data: Trajectories, predicted: Float[np.ndarray, "N d"], names: Sequence[str], units: Sequence[str]
-) -> Figure:
-    """Measured and predicted torque and their difference over the first motion, one row per joint.
-
-    Args:
-        data: held-out data.
-        predicted: predicted torque of every sample.
-        units: units of their forces, "N m" or "N".
-    """
-    shown = np.flatnonzero(data.trajectory == data.trajectory[0])[:MOST_SAMPLES]
-    figure, axes = style.figure(len(names), 1, height=0.6 + 1.1 * len(names), sharex=True)
-    for joint, axis in enumerate(axes[:, 0]):
-        measured, identified = data.tau[shown, joint], predicted[shown, joint]
-        for values, shade, width, label in (
-            (measured, "black", 1.6, "measured"),
-            (identified, style.BLUE, 1.0, "identified"),
-            (identified - measured, style.VERMILLION, 0.8, "identified minus measured"),
-        ):
-            axis.plot(data.t[shown], values, color=shade, linewidth=width, label=label)
-        style.title(axis, names[joint], loc="left", pad=2, fontsize=style.SMALL)
-        axis.set_ylabel(units[joint], fontsize=style.SMALL)
-        axis.margins(x=0.01)
-    label = str(data.label[data.trajectory[0]])
-    if block := re.fullmatch(r"(.*)\[(\d+)\]", label):  # a block of time, as `data.splits` names it
-        label = f"block {int(block[2]) + 1} of recording {block[1]}"
-    axes[-1, 0].set_xlabel(f"time, s (held out: {label})")
-    figure.align_ylabels(axes[:, 0])
-    style.legend_beside(figure, axes[0, 0], columns=3)
     return figure
 
 
 def torque_bands(
     data: Trajectories,
     predicted: Float[np.ndarray, "N d"],
-    std: Float[np.ndarray, "N d"],
-    out_of_distribution: np.ndarray,
+    bands: tuple[Float[np.ndarray, "N d"], np.ndarray] | None = None,
     *,
     model: str = "model",
+    names: Sequence[str] = (),
 ) -> Figure:
-    """Torque errors within their 95 % bands along the first held-out samples, one row per joint, and their coverage.
+    """Measured torque and model over the first held-out motions, one panel per joint, with the error below.
 
-    States flagged as out of distribution are shaded. `predicted` and `std` are the model's; its name sets the colour.
+    With bands also the 95 % bands, the share of all held-out samples within them, and the coverage of bands of every
+    level. Errors and bands may leave their panel where they are largest.
+
+    Args:
+        data: held-out data.
+        predicted: predicted torque of every sample.
+        bands: standard deviations [N, d] of the torques, and flags [N] of states out of distribution, which are marked.
+        model: name of the model, which sets the colour.
+        names: names of the joints; by default their numbers.
     """
-    d, shown = min(data.degrees_of_freedom, MOST_BANDS), np.arange(min(len(data.t), MOST_BAND_SAMPLES))
-    error = predicted - data.tau
-    covered = coverage(error, std)
-    figure = style.blank(height=max(2.6, 0.85 * d + 0.9))
-    grid = figure.add_gridspec(d, 2, width_ratios=[1.7, 1.0])
-    axes = [figure.add_subplot(grid[joint, 0]) for joint in range(d)]
-    right = figure.add_subplot(grid[:, 1])
-    style.prepare(*axes, right)
-    bands = half_width(LEVEL) * std[shown]
-    within = np.maximum(np.quantile(bands, 0.98, axis=0), np.quantile(np.abs(error[shown]), 0.995, axis=0))
-    # One unit for all joints, so that their errors can be compared.
-    factor, prefix = style.prefixed(float(within[:d].max()), "")
-    breaks = np.flatnonzero(np.diff(data.trajectory[shown])) + 0.5
-    for joint, axis in enumerate(axes):
-        band, largest = bands[:, joint] / factor, 1.1 * within[joint] / factor
-        shade = style.colour(model)
-        axis.fill_between(shown, -band, band, color=shade, alpha=0.25, linewidth=0, label="95 % band")
-        axis.plot(shown, error[shown, joint] / factor, color="black", linewidth=0.8, label="predicted minus measured")
-        axis.set_ylim(-largest, largest)
-        flagged = np.repeat(out_of_distribution[shown], 2)
-        edges = (shown[:, None] + [-0.5, 0.5]).ravel()
-        axis.fill_between(edges, -largest, largest, where=flagged, color="0.5", alpha=0.25, linewidth=0)
-        style.separate(axis, breaks)
-        axis.set_ylabel(f"joint {joint + 1},\n{prefix}{style.unit_of(data, joint)}")
-        axis.tick_params(axis="x", labelbottom=joint == d - 1)
-        axis.margins(x=0.01)
-    style.legend_beside(figure, axes[0], columns=2, place="outside lower left")
-    axes[-1].set_xlabel("held-out sample; grey: out of distribution")
-    right.plot([0, 1], [0, 1], color=style.REFERENCE, linewidth=1.0)
-    right.fill_between([0, 1], [-0.05, 0.95], [0.03, 1.03], color=style.REFERENCE, alpha=0.15, linewidth=0)
-    for joint, shares in enumerate(covered.T[:d]):
-        right.plot(LEVELS, shares, color=style.CYCLE[joint], linewidth=1.2, label=f"joint {joint + 1}")
-    right.set(xlim=(0, 1), ylim=(0, 1), xlabel="level of the band", ylabel="share of torques in it")
-    style.legend(right, loc="lower right")
+    samples, x, _, breaks, (of_data, of_model), time = _on_one_axis(data, MOST_BANDS)
+    error, shade, d = predicted - data.tau, style.colour(model), data.degrees_of_freedom
+    wide = [1.9, 1.0][: 1 + (bands is not None)]
+    figure = style.blank(height=0.8 + 1.55 * d)
+    grid = figure.add_gridspec(2 * d, len(wide), width_ratios=wide, height_ratios=[1.8, 1.0] * d)
+    axes = [figure.add_subplot(grid[row, 0]) for row in range(2 * d)]
+    names = names or [f"joint {joint + 1}" for joint in range(d)]
+    style.prepare(*axes)
+    for joint, (axis, below) in enumerate(zip(axes[::2], axes[1::2], strict=True)):
+        mean, off, text = predicted[samples, joint], error[samples, joint], names[joint]
+        largest, unit = float(np.quantile(np.abs(off), SHOWN)), style.unit_of(data, joint)
+        factor, prefixed = style.prefixed(largest, unit)
+        axis.plot(x, data.tau[samples, joint], of_data, color="black", linewidth=2.0, markersize=4, label="measured")
+        axis.plot(x, mean, of_model, color=shade, linewidth=1.3, label=model)
+        axis.set_ylim(axis.get_ylim())  # whatever the width of the band
+        below.plot(x, off / factor, of_model[:1], color=shade, linewidth=0.9)
+        limit = 1.5 * largest / factor or 1.0
+        below.set_ylim(-limit, limit)
+        if bands is not None:
+            std, flags = bands
+            half = half_width(LEVEL) * std[:, joint]
+            text += f": {100 * np.mean(np.abs(error[:, joint]) <= half):.1f} % of samples within the band"
+            for side, middle, scale in ((axis, mean, 1.0), (below, 0.0, factor)):
+                low, high = ((middle + sign * half[samples]) / scale for sign in (-1, 1))
+                side.fill_between(x, low, high, color=shade, alpha=0.25, linewidth=0, label="95 % band")
+            if flags[samples].any():
+                places = x[flags[samples]]
+                look = {"color": style.VERMILLION, "markersize": 5, "label": "out of distribution"}
+                axis.plot(places, 0 * places, "|", transform=axis.get_xaxis_transform(), **look)
+        for side in (axis, below):
+            style.separate(side, breaks)
+            side.margins(x=0.01)
+            side.tick_params(axis="x", bottom=side is axes[-1], labelbottom=side is axes[-1])
+        style.title(axis, text, loc="left", pad=3, fontsize=style.SMALL)
+        axis.set_ylabel(unit)
+        below.set_ylabel(f"error,\n{prefixed}")
+        below.locator_params(axis="y", nbins=3)
+    axes[-1].set_xlabel(time)
+    figure.align_ylabels(axes)
+    style.legend_beside(figure, axes[0], columns=4)
+    if bands is not None:
+        right = figure.add_subplot(grid[:, 1])
+        style.prepare(right)
+        right.plot([0, 1], [0, 1], color=style.REFERENCE, linewidth=1.0)
+        right.fill_between([0, 1], [-0.05, 0.95], [0.03, 1.03], color=style.REFERENCE, alpha=0.15, linewidth=0)
+        for name, shares in zip(names, coverage(error, bands[0]).T, strict=True):
+            right.plot(LEVELS, shares, color=style.colours_of(names)[name], linewidth=1.2, label=name)
+        right.set(xlim=(0, 1), ylim=(0, 1), xlabel="level of the band", ylabel="share of samples in it")
+        right.set(box_aspect=1, anchor="N")
+        style.legend(right, loc="lower right")
     return figure
 
 
@@ -229,8 +250,7 @@ def friction_curves(
     *,
     names: Sequence[str] = (),
     measured: tuple[Any, Any] | None = None,
-    rate_unit: str | Sequence[str] = "rad/s",
-    force_unit: str | Sequence[str] = "N m",
+    joints: Sequence[JointKind] = (),
 ) -> Figure:
     """Friction curves, one panel per joint.
 
@@ -239,11 +259,10 @@ def friction_curves(
         names: names of the joints; by default their numbers.
         measured: rates and forces [N, d], for example torque minus that of the links, drawn as points; the most extreme
             hundredth may lie out of view.
-        rate_unit, force_unit: one unit for all joints, or one per joint.
+        joints: kinds of the joints, by default revolute.
     """
     colours, d = style.colours_of(curves), np.shape(next(iter(curves.values()))[0])[1]
-    units = list(zip(np.broadcast_to(rate_unit, d), np.broadcast_to(force_unit, d), strict=True))
-    alike = len({*units}) == 1
+    units = [("m/s", "N") if kind == "prismatic" else ("rad/s", "N m") for kind in joints or ["revolute"] * d]
     columns = min(d, MOST_COLUMNS)
     rows = -(-d // columns)
     figure, axes = style.figure(rows, columns, height=0.6 + 2.4 * rows)
@@ -266,10 +285,8 @@ def friction_curves(
         axis.locator_params(axis="x", nbins=5)
         if d > 1:
             style.title(axis, names[joint] if names else f"joint {joint + 1}")
-        if joint >= d - columns or not alike:
-            axis.set_xlabel(f"rate, {units[joint][0]}")
-        if joint % columns == 0 or not alike:
-            axis.set_ylabel(f"friction, {units[joint][1]}")
+        axis.set_xlabel(f"rate, {units[joint][0]}")
+        axis.set_ylabel(f"friction, {units[joint][1]}")
     style.legend_beside(figure, axes[0, 0], columns=4)
     return figure
 

@@ -9,8 +9,6 @@ from matplotlib.figure import Figure
 from dln_jax.figures import style
 from dln_jax.learning.engine.problem import Progress
 
-SHORTEST_SHARE = 0.2
-"""If a stage is shorter than this fraction of the steps, the stage names are vertical."""
 OF_LOSSES = {"error": "loss", "loss": "training loss"}
 """Labels of a curve that shows losses."""
 
@@ -36,7 +34,6 @@ def training_curve(
         "monitor": ("-", "black", f"test {error}"),
     }
     every, last, start = [], history[-1].step, 0
-    upright = min(np.diff([0, *(stage[-1].step for stage in stages)])) < SHORTEST_SHARE * last
     for stage in stages:
         for field, (dash, colour, label) in curves.items():
             values = [float(np.median(getattr(at, field))) for at in stage]
@@ -46,12 +43,9 @@ def training_curve(
                 every += values
         if start:
             axis.axvline(start, color="0.4", linewidth=0.8)
-        end = stage[-1].step
-        place = (start + 0.004 * last, 0.98) if upright else ((start + end) / 2, 1.02)
-        name = axis.text(*place, stage[0].stage, transform=axis.get_xaxis_transform(), color="0.3")
-        name.set(fontsize=style.SMALL, rotation=90.0 * upright, ha="left" if upright else "center")
-        name.set_va("top" if upright else "bottom")
-        start = end
+        look = {"transform": axis.get_xaxis_transform(), "rotation": 90.0, "color": "0.3", "fontsize": style.SMALL}
+        axis.text(start + 0.004 * last, 0.98, stage[0].stage, va="top", **look)
+        start = stage[-1].step
     axis.set_yscale(style.scale_of(every))
     axis.axvline(best_step, color="0.6", linestyle=":", label="kept parameters")
     axis.set(xlim=(0, max(1.02 * last, 1)), xlabel="optimiser step", ylabel=unit)

@@ -180,7 +180,7 @@ def bands_of(
         "coverage_95_worst_joint_share": float(shares[np.argmax(abs(shares - LEVEL))]),
         "out_of_distribution_share": float(out_of_distribution.mean()),
     }
-    return metrics, {"uncertainty.png": png(torque_bands, test, predicted, std, out_of_distribution, model=fit.name)}
+    return metrics, {"uncertainty.png": png(torque_bands, test, predicted, (std, out_of_distribution), model=fit.name)}
 
 
 def bands(model: Model, parameters: Any, uncertainty: Uncertainty, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:

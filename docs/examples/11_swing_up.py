@@ -20,7 +20,7 @@ from dln_jax.control.energy_shaping import EnergyGains, energy_shaping, parts_of
 from dln_jax.control.regulators import lqr, region_of_attraction, regulated, switched, value
 from dln_jax.control.state_space import error, field_of, holding_controls, linearise
 from dln_jax.figures import style
-from dln_jax.figures.closed_loops import rotary_pendulum_drawing, write_closed_loop_gif
+from dln_jax.figures.closed_loops import angle_ticks, rotary_pendulum_drawing, write_closed_loop_gif
 from dln_jax.scenes.pendulums import rotary_pendulum
 
 jax.config.update("jax_enable_x64", True)
@@ -114,7 +114,13 @@ axis.plot(np.where(jumps, np.nan, pole)[1:].T, speed[1:].T, color=style.SKY, lin
 axis.plot(np.where(jumps, np.nan, pole)[0], speed[0], color=style.BLUE, linewidth=1.8)
 axis.plot(pole[:, 0], speed[:, 0], "o", color=style.BLUE, markersize=3)
 axis.fill(*caught, color=style.GREEN, alpha=0.45, zorder=4)
-axis.set(xlim=(-np.pi, np.pi), xlabel="angle from upright, rad", ylabel="rate, rad/s")
+style.prepare(axis)
+axis.grid(False)
+look = {"ha": "center", "fontsize": style.TEXT, "arrowprops": {"arrowstyle": "-"}}
+axis.annotate("the regulator takes over", (0.0, 0.0), (0.0, 15.0), **look)
+axis.annotate("energy of upright", (-2.3, -19.5), (-1.9, -25.0), **look)
+axis.set(xlim=(-np.pi, np.pi), xlabel="pole's angle from upright, rad", ylabel="rate, rad/s")
+angle_ticks(axis.xaxis)
 
 # %%
 # The last figure shows angles and torques over time, for all starts.

@@ -90,15 +90,17 @@ print(
 )
 assert lowest.min() < lowest[0] - 0.01
 
-skin, colours = boundary(mesh), np.full((len(mesh.vertices), 3), 0.2)
+skin, colours = boundary(mesh), np.full((len(mesh.vertices), 3), 0.3)
 for name, colour in (("stiff", style.BLUE), ("soft", style.ORANGE)):
     colours[np.setdiff1d(mesh.sets[name].vertices, scene.held)] = to_rgb(colour)
-figure = plt.figure(figsize=(7, 4.5))
+figure = plt.figure(figsize=(7.2, 4.6))
 axes = figure.add_axes((-0.15, -0.55, 1.3, 2), projection="3d", computed_zorder=False)
 for column, k in enumerate(shown):
     corners, looks = x[k][skin] + [0.0, 0.15 * column, 0.0], colours[skin].mean(axis=1)
     axes.add_collection3d(Poly3DCollection(corners, facecolors=looks, shade=True, lightsource=LightSource(250, 50)))
     axes.text(0.0, 0.15 * column, 0.03, f"{DT * k:.2f} s", ha="center")
+for row, (text, colour) in enumerate({"clamp": "0.3", "stiff half": style.BLUE, "soft half": style.ORANGE}.items()):
+    axes.text(0.0, -0.05, -0.14 - 0.022 * row, text, color=colour)
 depth = 1.05 * lowest.min()
 axes.set(xlim=(-0.06, 0.06), ylim=(-0.05, 0.5), zlim=(depth, 0.04))
 axes.set_box_aspect((0.12, 0.55, 0.04 - depth), zoom=0.84)

@@ -63,13 +63,16 @@ assert not any(crossings(mesh, at) for at in x)
 # %%
 # The figure shows the band at four moments.
 
-figure, panels = plt.subplots(2, 2, figsize=(7, 4.2), sharex=True, sharey=True, layout="constrained")
+figure, panels = plt.subplots(2, 2, figsize=(7.2, 4.2), sharex=True, sharey=True, layout="constrained")
 every = np.concatenate([mesh.vertices[None], x])
 for axes, k in zip(panels.ravel(), np.linspace(0, STEPS, 4).astype(int), strict=True):
     axes.add_patch(plt.Circle((0.0, 0.25), 0.12, color="0.7"))
     axes.axhspan(-0.06, 0.0, color="0.8")
     axes.add_collection(
-        PolyCollection(every[k][mesh.elements], facecolor=style.BLUE, edgecolor=style.BLUE, linewidth=0.5)
+        PolyCollection(every[k][mesh.elements], facecolor=style.BLUE, edgecolor=style.BLUE, linewidth=1.0)
     )
-    axes.set(xlim=(-0.55, 0.75), ylim=(-0.06, 0.52), aspect="equal", title=f"{DT * k:.2f} s")
+    axes.set(xlim=(-0.55, 0.75), ylim=(-0.06, 0.52), aspect="equal")
+    style.title(axes, f"{DT * k:.2f} s")
     axes.set_axis_off()
+    axes.plot([0.5, 0.7], [0.2, 0.2], color="0.2", linewidth=2)
+    axes.text(0.6, 0.22, "0.2 m", ha="center", fontsize=style.SMALL)

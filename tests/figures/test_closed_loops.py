@@ -1,6 +1,7 @@
 """Figures of closed loops show the limits, the failures and the whole run; films move in real time."""
 
 import numpy as np
+import pytest
 from calls import one_line
 from numpy.testing import assert_array_equal
 from PIL import Image
@@ -34,12 +35,16 @@ def test_traces_show_every_coordinate_and_the_limits():
         closed_loop_traces(runs, ("revolute",))
 
 
-def test_a_film_is_as_long_as_its_run(tmp_path):
+@pytest.mark.parametrize("outcome", ["true", "false"])
+def test_a_film_is_as_long_as_its_run_and_an_mp4_if_ffmpeg_succeeds(outcome, tmp_path, monkeypatch):
     path = tmp_path / "film.gif"
+    (tmp_path / "ffmpeg").symlink_to(f"/usr/bin/{outcome}")
+    monkeypatch.setenv("PATH", str(tmp_path))
     for drawing in (cart_pole_drawing(0.3), rotary_pendulum_drawing(0.1, 0.13)):
         write_closed_loop_gif(path, drawing, T, Q, U, limits=(-2.0, 2.0), frames_per_second=4.0)
         with Image.open(path) as film:
             assert getattr(film, "n_frames", 1) == 4 and film.info["duration"] == 250
+        assert path.with_suffix(".mp4").exists() == (outcome == "true")
     with one_line("all finite"):
         write_closed_loop_gif(path, drawing, T, Q * np.nan, U)
 

@@ -23,7 +23,7 @@ from dln_jax.data.log import SPLIT, Parts, read_log, split_log
 from dln_jax.data.robot_files import write_robot
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.splits import Split, is_cut
-from dln_jax.figures.torques import friction_curves, torque_by_joint
+from dln_jax.figures.torques import friction_curves, torque_bands
 from dln_jax.files import write_bytes, write_json
 from dln_jax.identification.identify import base_rows, findings, identify, parameter_rows, summary, text
 from dln_jax.identification.residual import inner_split
@@ -176,7 +176,7 @@ def run(options: Arguments) -> None:
         units = ["N m" if kind == "revolute" else "N" for kind in tree.joints]
         figures: dict[str, Callable[[Path], None]] = {}
         if options.figures:
-            figures["torque.png"] = png(torque_by_joint, test, torques[FITTED], names, units)
+            figures["torque.png"] = png(torque_bands, test, torques[FITTED], model=fit.name, names=names)
             if description["needs"]["joint_friction"]:
                 # All joints at once, each over its own range: friction in a joint does not depend on the others.
                 rates = np.linspace(test.qd.min(axis=0), test.qd.max(axis=0), len(test.t))
@@ -187,9 +187,8 @@ def run(options: Arguments) -> None:
                     friction_curves,
                     {"identified": (rates, curves)},
                     names=names,
-                    force_unit=units,
                     measured=(test.qd, test.tau - (torque - friction)),
-                    rate_unit=["rad/s" if unit == "N m" else "m/s" for unit in units],
+                    joints=tree.joints,
                 )
         if options.uncertainty:
             try:

@@ -47,6 +47,8 @@ MOST_PANELS = 6
 """Largest number of problems drawn in panels of their own."""
 MOST_COLOURS = 8
 """Largest number of colours in the legend."""
+MOST_NAMED = 12
+"""Largest number of medians that are named in the figure rather than by a legend."""
 RUN: dict[str, Any] = {"markersize": 4, "markeredgewidth": 0, "alpha": 0.45, "zorder": 2}
 MEDIAN: dict[str, Any] = {"markersize": 8, "markeredgewidth": 0, "zorder": 3}
 BEST: dict[str, Any] = {"markersize": 13, "fillstyle": "none", "zorder": 4}
@@ -223,7 +225,7 @@ def sweep_figure(results: Mapping[str, Any], at_once: int | None) -> Figure | No
     """Draws error against training time, `at_once` jobs at once; `None` if no job has both.
 
     Each problem has a panel, unless there are many. The first two options that no medians are taken over are shown by
-    colours and markers. Runs are faint if there are medians.
+    colours and markers, and named at the medians, or in a legend if there are many. Runs beside medians are faint.
     """
     rows, over, names = results["jobs"], results["over"], results["names"]
     shown = [(row["values"], row["metrics"], RUN if over else MEDIAN) for row in rows]
@@ -243,13 +245,17 @@ def sweep_figure(results: Mapping[str, Any], at_once: int | None) -> Figure | No
         return shortened(values.get(name, ""))
 
     kinds, forms = (list(dict.fromkeys(look(point[0], name) for point in points)) for name in (colour, marker))
-    colours = dict(zip(kinds, colormaps["viridis"](np.linspace(0, 0.95, len(kinds))), strict=True))
+    colours = dict(zip(kinds, colormaps["viridis"](np.linspace(0, 0.85, len(kinds))), strict=True))
     markers = {form: style.MARKERS[number % len(style.MARKERS)] for number, form in enumerate(forms)}
+
+    named = len(results["groups"]) <= MOST_NAMED
+    beside = f" (jobs at once: {at_once})" if at_once else ""
+    work = seconds.removesuffix("_seconds").replace("train", "training")
 
     problems = problems if panels else [()]
     columns = min(len(problems), 2)
     lines = -(-len(problems) // columns)
-    figure, axes = style.figure(lines, columns, height=2.7 * lines + 1.1 if columns > 1 else 4.0)
+    figure, axes = style.figure(lines, columns, height=2.7 * lines + 1.3)
     for axis in axes.flat[len(problems) :]:
         axis.axis("off")
     for axis, problem in zip(axes.flat, problems, strict=False):
@@ -257,32 +263,30 @@ def sweep_figure(results: Mapping[str, Any], at_once: int | None) -> Figure | No
         for values, x, y, size in here:
             if size is BEST:
                 axis.plot(x, y, "o", color="black", **size)
-            else:
-                axis.plot(x, y, markers[look(values, marker)], color=colours[look(values, colour)], **size)
+                continue
+            kind, form = look(values, colour), look(values, marker)
+            axis.plot(x, y, markers[form], color=colours[kind], **size)
+            if size is MEDIAN and named:
+                text = f"{spaced(colour)} {kind} {spaced(marker)} {form}".removeprefix("model ")
+                axis.annotate(text, (x, y), (7, 0), textcoords="offset points", va="center", fontsize=style.SMALL)
         axis.set_xscale(style.scale_of(x for _, x, _, _ in here))
         axis.set_yscale(style.scale_of(y for _, _, y, _ in here))
         style.title(axis, ", ".join(f"{name} {shortened(text)}" for name, text in problem))
-    beside = "" if at_once is None else f", {at_once} jobs at once" if at_once > 1 else ", one job at a time"
-    work = seconds.removesuffix("_seconds").replace("train", "training")
-    for axis in axes.flat[max(0, len(problems) - columns) : len(problems)]:
         axis.set_xlabel(f"{work}, s{beside}")
-    for axis in axes[:, 0]:
         axis.set_ylabel("test " * (error in COMPARED["error"]) + spaced(error))
 
     def handle(marker: str, label: str, **looks: Any) -> Line2D:
         return Line2D([], [], marker=marker, label=label, **{"linestyle": "", "color": "0.4", **looks})
 
     handles = []
-    if colour:
+    if not named:
         few = kinds[:: -(-len(kinds) // MOST_COLOURS)]
         handles += [handle("s", f"{spaced(colour)} {kind}", color=colours[kind]) for kind in few]
-    if marker:
-        handles += [handle(markers[form], f"{spaced(marker)} {form}") for form in forms]
+        handles += [handle(markers[form], f"{spaced(marker)} {form}") for form in forms if form]
     if over:
         handles += [handle("o", "a run", **RUN), handle("o", "median", **MEDIAN)]
     if any(row["best"] for row in rows):
-        handles.append(handle("o", "best in validation", **{**BEST, "color": "black", "markersize": 10}))
-    if handles or unfinished(rows):
-        note = {"title": unfinished(rows) or None, "title_fontsize": style.SMALL}
-        style.legend(figure, handles=handles, loc="outside lower center", ncols=4, **note)
+        handles.append(handle("o", "best in validation", **{**BEST, "color": "black"}))
+    note = {"title": unfinished(rows) or None, "title_fontsize": style.SMALL}
+    style.legend(figure, handles=handles, loc="outside lower center", ncols=4, **note)
     return figure
