@@ -25,6 +25,8 @@ PARTS = {
 }
 MOST_JOINTS, MOST_MOTIONS, MOST_PATHS = 4, 6, 24
 """Largest numbers of joints, motions and paths shown."""
+MOST_ROWS = 3
+"""Largest number of joints below each other; more stand in two columns."""
 MOST_COLUMNS, MOST_EXCITED = 3, 8
 """Largest numbers of columns in a figure of friction, and of joints in one of excitation motions."""
 MOST_BANDS = 40
@@ -143,17 +145,19 @@ def torque_bands(
     """
     samples, x, _, breaks, (of_data, of_model), time = _on_one_axis(data, MOST_BANDS)
     error, shade, d = predicted - data.tau, style.colour(model), data.degrees_of_freedom
-    wide = [1.9, 1.0][: 1 + (bands is not None)]
-    figure = style.blank(height=0.8 + 1.55 * d)
-    grid = figure.add_gridspec(2 * d, len(wide), width_ratios=wide, height_ratios=[1.8, 1.0] * d)
-    axes = [figure.add_subplot(grid[row, 0]) for row in range(2 * d)]
+    columns, cells = 1 + (d > MOST_ROWS), d + (bands is not None)
+    rows, wide = (-(-cells // 2), [1.0, 1.0]) if columns == 2 else (d, [1.9, 1.0][: cells - d + 1])
+    figure = style.blank(height=0.8 + 1.55 * rows)
+    grid = figure.add_gridspec(2 * rows, len(wide), width_ratios=wide, height_ratios=[1.8, 1.0] * rows)
+    places = [divmod(joint, columns) for joint in range(d)]
+    axes = [figure.add_subplot(grid[2 * row + below, column]) for row, column in places for below in (0, 1)]
     names = names or [f"joint {joint + 1}" for joint in range(d)]
     style.prepare(*axes)
     for joint, (axis, below) in enumerate(zip(axes[::2], axes[1::2], strict=True)):
         mean, off, text = predicted[samples, joint], error[samples, joint], names[joint]
         largest, unit = float(np.quantile(np.abs(off), SHOWN)), style.unit_of(data, joint)
         factor, prefixed = style.prefixed(largest, unit)
-        axis.plot(x, data.tau[samples, joint], of_data, color="black", linewidth=2.0, markersize=4, label="measured")
+        axis.plot(x, data.tau[samples, joint], of_data, color="0.45", linewidth=2.0, markersize=4, label="measured")
         axis.plot(x, mean, of_model, color=shade, linewidth=1.3, label=model)
         axis.set_ylim(axis.get_ylim())  # whatever the width of the band
         below.plot(x, off / factor, of_model[:1], color=shade, linewidth=0.9)
@@ -167,22 +171,24 @@ def torque_bands(
                 low, high = ((middle + sign * half[samples]) / scale for sign in (-1, 1))
                 side.fill_between(x, low, high, color=shade, alpha=0.25, linewidth=0, label="95 % band")
             if flags[samples].any():
-                places = x[flags[samples]]
+                flagged = x[flags[samples]]
                 look = {"color": style.VERMILLION, "markersize": 5, "label": "out of distribution"}
-                axis.plot(places, 0 * places, "|", transform=axis.get_xaxis_transform(), **look)
+                axis.plot(flagged, 0 * flagged, "|", transform=axis.get_xaxis_transform(), **look)
         for side in (axis, below):
             style.separate(side, breaks)
             side.margins(x=0.01)
-            side.tick_params(axis="x", bottom=side is axes[-1], labelbottom=side is axes[-1])
+            last = side is below and joint + columns >= d
+            side.tick_params(axis="x", bottom=last, labelbottom=last)
         style.title(axis, text, loc="left", pad=3, fontsize=style.SMALL)
         axis.set_ylabel(unit)
         below.set_ylabel(f"error,\n{prefixed}")
         below.locator_params(axis="y", nbins=3)
-    axes[-1].set_xlabel(time)
-    figure.align_ylabels(axes)
+    for column in range(columns):
+        axes[1::2][column - columns].set_xlabel(time)
+        figure.align_ylabels(axes[2 * column :: 2 * columns] + axes[2 * column + 1 :: 2 * columns])
     style.legend_beside(figure, axes[0], columns=4)
     if bands is not None:
-        right = figure.add_subplot(grid[:, 1])
+        right = figure.add_subplot(grid[2 * (d // 2) : 2 * (d // 2) + 2, d % 2] if columns == 2 else grid[:, 1])
         style.prepare(right)
         right.plot([0, 1], [0, 1], color=style.REFERENCE, linewidth=1.0)
         right.fill_between([0, 1], [-0.05, 0.95], [0.03, 1.03], color=style.REFERENCE, alpha=0.15, linewidth=0)
@@ -190,7 +196,7 @@ def torque_bands(
             right.plot(LEVELS, shares, color=style.colours_of(names)[name], linewidth=1.2, label=name)
         right.set(xlim=(0, 1), ylim=(0, 1), xlabel="level of the band", ylabel="share of samples in it")
         right.set(box_aspect=1, anchor="N")
-        style.legend(right, loc="lower right")
+        style.legend(right, loc="lower right" if columns == 1 else (1.05, 0.0))
     return figure
 
 
