@@ -181,7 +181,7 @@ def judge(errors: HeldOut, names: Sequence[str] | None = None, *, quantity: str 
         reason = f"more than {UNEXPLAINED:.0%} of the {quantity} of {_listed(names, doubtful)} is unexplained"
         if not doubtful.any():
             ratio = np.max(share[far] / noise[far])
-            reason = f"errors of {_listed(names, far)} are up to {ratio:.2g} times the noise of the {quantity}"
+            reason = f"errors of {_listed(names, far)} are up to {ratio:.3g} times the noise of the {quantity}"
         reason += f": {numbers}"
         remedy = "add what the model lacks (friction, a load), remove outliers, or record more motions; see check_data"
         return Verdict("doubtful", reason, remedy)

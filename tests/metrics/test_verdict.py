@@ -31,8 +31,8 @@ def test_level_and_reason():
     for predicted, level, words in (
         (TRUTH, "good", "held-out nMSE 0.002"),
         (TRUTH + 0.05 * SCALE, "good", "worst"),
-        (TRUTH + 0.12 * SCALE, "doubtful", "errors of hip, knee, toe are up to 6.7 times the noise"),
-        (with_joint(1, TRUTH[:, 1] + 0.12 * SCALE[1]), "doubtful", "errors of knee are up to 6.7 times the noise"),
+        (TRUTH + 0.12 * SCALE, "doubtful", "errors of hip, knee, toe are up to 6.69 times the noise"),
+        (with_joint(1, TRUTH[:, 1] + 0.12 * SCALE[1]), "doubtful", "errors of knee are up to 6.69 times the noise"),
         (with_joint(1, TRUTH[:, 1] + 0.4 * SCALE[1]), "doubtful", "5% of the torque of knee is unexplained"),
         (with_joint(2, -TRUTH[:, 2]), "refused", "torque of toe is predicted no better than by a constant"),
         (0 * TRUTH, "refused", "knee"),
