@@ -8,10 +8,12 @@ The C code does not allocate memory and keeps no state. dln_jax.load_c compiles 
 dln_jax.export_c exports any other JAX function.
 """
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from dln_jax.errors import InputError
 from dln_jax.options import Unstated
 
 
@@ -21,8 +23,9 @@ class Arguments:
 
     run: Path
     """Folder of a training run, with model.json and model.safetensors."""
-    out: Path
-    """Folder for NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt; created if missing."""
+    out: Unstated[Path] = None
+    """Folder of NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt (default: RUN-c-1, -2, ... beside the folder
+    RUN)."""
     functions: Unstated[tuple[str, ...]] = None
     """Names, such as inverse_dynamics step_rk4_jacobian (default: all; a wrong name lists them)."""
     precision: Unstated[Literal["f32", "f64"]] = None
@@ -47,8 +50,14 @@ def main(options: Arguments) -> None:
     from dln_jax.export.functions import functions_of_run
     from dln_jax.zoo.run import load
 
+    run, out = load(options.run), options.out
+    if out is None:
+        names = (f"{options.run.resolve().name}-c-{number}" for number in itertools.count(1))
+        out = next(folder for name in names if not (folder := options.run.parent / name).exists())
+    elif (out / "CMakeLists.txt").exists() and not options.overwrite:
+        raise InputError(f"the folder {out} already contains an export; choose another --out, or add --overwrite")
     functions = functions_of_run(
-        load(options.run),
+        run,
         precision=options.precision,
         names=options.functions,
         iterations=options.iterations,
@@ -59,14 +68,14 @@ def main(options: Arguments) -> None:
         casadi = [name for name in functions if not name.endswith(("_jacobian", "_gradient", "_hessian"))]
     paths = export_c(
         functions,
-        options.out,
+        out,
         name=options.name,
         casadi=casadi,
         finite=options.finite,
         leave_out_large=options.functions is None,
         overwrite=options.overwrite,
     )
-    print(f"{options.out}: {', '.join(path.name for path in paths)}")
+    print(f"{out}: {', '.join(path.name for path in paths)}")
     for path in paths:
         for line in path.read_text().splitlines():
             if line.startswith(" * Left out: "):

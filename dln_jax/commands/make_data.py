@@ -46,6 +46,8 @@ def main(options: Arguments) -> None:
     from dln_jax.scenes.datasets import generators
     from dln_jax.scenes.registry import scene_named
 
+    if options.out.exists() and not options.overwrite:
+        raise InputError(f"{options.out} already exists; choose another --out, or add --overwrite")
     scene, kind = scene_named(options.scene), options.kind
     unused = {name for names in OF_KIND.values() for name in names} - set(OF_KIND[kind])
     refuse_given(options, sorted(unused), f"not used for --kind {kind}")

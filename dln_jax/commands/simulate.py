@@ -83,7 +83,7 @@ def main(options: Arguments) -> None:
     from dln_jax.metrics.report import conditions, write_report
     from dln_jax.precision import data_type
     from dln_jax.runs.folder import command_folder
-    from dln_jax.runs.report import Report, finish
+    from dln_jax.runs.report import Report, finish, rows_of
     from dln_jax.softbody.examples import EXAMPLES
     from dln_jax.softbody.mesh.files import write_motion
 
@@ -98,6 +98,7 @@ def main(options: Arguments) -> None:
             announce(prepared, options)
             motion = run_motion(prepared, precision)
             rows = results(name, mesh, motion)
+            numbers = {row.quantity: row.value for row in rows}
             dtype = jnp.dtype(precision).name
             facts = conditions(dtype=dtype, seeds=[0], integrator=options.integrator, dt=dt)
             write_report(own / "report.json", rows, facts)
@@ -106,18 +107,10 @@ def main(options: Arguments) -> None:
                 moving = mesh, motion.t[shown], motion.x[shown], motion.v[shown]
                 write_motion(own / "motion.pvd", *moving, stride=motion.stride)
             pictures.append(moments_of(name, example, motion))
-            table = [
-                (
-                    LABELS.get(row.quantity, row.quantity.replace("_", " ")),
-                    f"{row.value:.4g}",
-                    "" if row.unit == "1" else row.unit,
-                )
-                for row in rows
-            ]
             title = f"{name}: {options.integrator}, dt = {dt:.4g} s"
             report = Report(
-                metrics={row.quantity: row.value for row in rows if math.isfinite(row.value)},
-                rows=table,
+                metrics={name: value for name, value in numbers.items() if math.isfinite(value)},
+                rows=rows_of(numbers, LABELS, {row.quantity: row.unit for row in rows}),
                 title="",
                 lines=tuple(warnings(motion)),
                 figures=figures_of(name, example, motion, pictures[-1], title),

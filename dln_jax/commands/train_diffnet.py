@@ -95,7 +95,7 @@ def main(options: Arguments) -> None:
     from dln_jax.runs.devices import mesh_of
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
-    from dln_jax.runs.report import Report, cost_metrics, finish, number, png, unit_of
+    from dln_jax.runs.report import Report, cost_metrics, finish, png, rows_of
     from dln_jax.scale import device_lines
     from dln_jax.types import require_seed
     from dln_jax.zoo.descriptions import describe
@@ -235,7 +235,7 @@ def main(options: Arguments) -> None:
             lines = ("the loss stopped being finite; the run keeps the best parameters before that", *lines)
         report = Report(
             metrics=metrics | {"verdict": verdict.number},
-            rows=[(key.replace("_", " "), number(key, value), unit_of(key, UNITS)) for key, value in metrics.items()],
+            rows=rows_of(metrics, units=UNITS),
             title=f"test on {function}, {network.precision}",
             verdict=verdict,
             ended_by_user=bool(options.steps or options.epochs),

@@ -145,6 +145,6 @@ def say_selection(context: Context, title: str, kept: str, ended: str, rows: Seq
     Console(file=text, highlight=False, soft_wrap=True).print(table)
     context.say(text.getvalue().rstrip())
     if ended:
-        context.say(f"no further model was tried: {ended}")
+        context.say(f"Stopped: {ended}.")
     if context.folder is not None:
         write_json(context.folder / "selection.json", {"kept": kept, "ended": ended, "candidates": list(rows)})

@@ -153,12 +153,13 @@ def keep_programs(wanted: bool) -> str:
 
 
 @functools.cache
-def compilation() -> dict[str, float]:
+def compilation() -> dict[str, Any]:
     """Totals since the first call of this function, which are updated in place.
 
-    `seconds` is the compilation time, including programs that came from the cache; `cached` is the number of these.
+    `seconds` is the compilation time, including programs that came from the cache; `cached` is the number of these;
+    `unkept` is the reason if programs are not kept, and `line` the last line that was printed.
     """
-    counts = {"seconds": 0.0, "cached": 0}
+    counts: dict[str, Any] = {"seconds": 0.0, "cached": 0, "unkept": "", "line": ""}
 
     def count(event: str, **_: str | int) -> None:
         counts["cached"] += event == "/jax/compilation_cache/cache_hits"
@@ -171,14 +172,17 @@ def compilation() -> dict[str, float]:
     return counts
 
 
-def compilation_summary(since: dict[str, float], unkept: str = "") -> str:
-    """Summary of the compilation since a copy of the totals, in one line; empty if it was short and used no cache."""
-    seconds, cached = (now - since[name] for name, now in compilation().items())
-    if seconds < 0.5 and not cached:
-        return ""
-    many = {0: "no program", 1: "one program"}.get(int(cached), f"{cached} programs")
+def print_compilation() -> None:
+    """Prints the time of compilation in this process, if it is counted, was long or used the cache, and is news."""
+    if not compilation.cache_info().currsize:
+        return
+    seconds, cached, unkept, last = compilation().values()
+    many = {0: "no program", 1: "one program"}.get(cached, f"{cached} programs")
     why = f" (none is kept: {unkept})" if unkept else ""
-    return f"compilation took {seconds:.1f} s; {many} came from the cache{why}"
+    line = f"compilation took {seconds:.1f} s; {many} came from the cache{why}"
+    if (seconds >= 0.5 or cached) and line != last:
+        print(line)
+        compilation()["line"] = line
 
 
 def _remove_torn(folder: Path) -> None:

@@ -168,10 +168,10 @@ def run_folder(out: Path | None, default: str, *, resume: bool = False, resumabl
         folder, created = out, None
     else:
         folder, created = _next_number(Path("runs"), default) if out is None else (out, _create(out))
-        _require_free(folder, resumable)  # before locking, and again below once no other process can write
+        require_free(folder, resumable)  # before locking, and again below once no other process can write
     with locked(folder):
         if created is not None:
-            _require_free(folder, resumable)
+            require_free(folder, resumable)
         try:
             yield folder
         except KeyboardInterrupt as stop:
@@ -239,9 +239,14 @@ def _create(folder: Path) -> list[Path]:
         raise InputError(f"{folder}: cannot create the folder ({error.strerror}); choose another --out") from error
 
 
-def _require_free(folder: Path, resumable: bool) -> None:
+def require_free(folder: Path, resumable: bool) -> None:
+    """Raises `InputError` if a folder exists and holds anything but partial files of a killed process.
+
+    Args:
+        resumable: whether the calling command could continue a run in the folder.
+    """
     try:
-        free = holds_only(folder, LOCK)
+        free = not folder.exists() or holds_only(folder, LOCK)
     except OSError as error:
         raise InputError(f"{folder}: cannot read the folder ({error.strerror}); choose another --out") from error
     if not free:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dln_jax.errors import FitRefused, InputError, ProcessLost, require_magnitude, require_within
-from dln_jax.options import CompilationCache, NoCompilationCache, Scaled
+from dln_jax.options import CompilationCache, Folder, NoCompilationCache, Scaled
 from dln_jax.process import counting_from
 from dln_jax.runs.arguments import parse
 
@@ -55,24 +55,30 @@ def run(
         require_possible(own)
         # JAX takes a second to import, which the help and a mistake do not need.
         from dln_jax.runs import devices
-        from dln_jax.runs.folder import with_stored_arguments
+        from dln_jax.runs.folder import require_free, with_stored_arguments
+        from dln_jax.runs.progress import heartbeat
         from dln_jax.scale import losses_named
 
         # Data and references are float64; models state their own precision.
         devices.enable_double_precision()
         member = devices.membership_in(own) if isinstance(own, Scaled) else None
-        options = with_stored_arguments(own, arguments) if getattr(own, "resume", False) else own
-        before = devices.compilation().copy() if from_shell else None
-        unkept = devices.keep_programs(shared.compilation_cache) if from_shell else ""
+        if getattr(own, "resume", False):
+            options = with_stored_arguments(own, arguments)
+        else:
+            options = own
+            if isinstance(own, Folder) and own.out is not None:
+                require_free(own.out, hasattr(own, "resume"))  # before data are read
+        if from_shell:
+            devices.compilation()["unkept"] = devices.keep_programs(shared.compilation_cache)
 
     start = began if began is not None else time.perf_counter()
 
     def work(options: Any) -> None:
-        lost = contextlib.nullcontext() if member is None else losses_named(devices.remedy_of(options))
-        with as_one_line(prog, options), lost, counting_from(start):
+        nothing = contextlib.nullcontext()
+        lost = nothing if member is None else losses_named(devices.remedy_of(options))
+        with as_one_line(prog, options), lost, counting_from(start), heartbeat(start) if from_shell else nothing:
             main(options)
-            if before and (text := devices.compilation_summary(before, unkept)):
-                print(text)
+            devices.print_compilation()
             sys.stdout.flush()
 
     if member is not None:

@@ -110,16 +110,14 @@ def verdict_on_search(search: TreeFit, errors: HeldOut) -> tuple[Verdict | None,
         if above <= AT_NOISE:
             return None, numbers
     if agreeing < search.agreement:
-        reason = f"only {agreeing} of {count} descents reached the lowest loss, so a lower one may exist"
+        reason = f"only {agreeing} of {count} starts reached the lowest loss; a lower loss may exist"
         remedy = "try another --seed, more --seconds or a --kinematic-prior of the arm"
     elif twin is not None and not twin.same:
-        reason = f"two descents to the same loss found {twin.words}, so the motions do not determine the axes"
+        reason = f"two starts with the same loss {twin.words}; the motions do not determine the axes"
         remedy = "record more and different motions, or add a --kinematic-prior"
     elif above is not None and above > FAR_FROM_NOISE:
-        reason = f"held-out errors are {above:.2g} times the noise, though {agreeing} descents agree"
-        remedy = (
-            "record more and different motions, or add a --kinematic-prior; friction that the tree lacks looks the same"
-        )
+        reason = f"held-out errors are {above:.2g} times the noise, although {agreeing} starts agree"
+        remedy = "record more and different motions, or add a --kinematic-prior; missing friction has the same effect"
     else:
         return None, numbers
     return Verdict("doubtful", reason, remedy), numbers

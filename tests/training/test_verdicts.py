@@ -13,10 +13,10 @@ def test_learned_tree_says_how_its_frames_were_found():
     for agreeing, error, noise, said in [
         (5, 1e-4, 1e-4, ""),
         (1, 1e-4, 1e-4, ""),  # at the noise there is nothing lower
-        (1, 3e-4, 1e-4, "only 1 of 31 descents reached the lowest loss"),
-        (1, 3e-4, None, "only 1 of 31 descents"),
+        (1, 3e-4, 1e-4, "only 1 of 31 starts reached the lowest loss"),
+        (1, 3e-4, None, "only 1 of 31 starts"),
         (5, 3e-4, 1e-4, ""),
-        (5, 5e-4, 1e-4, "held-out errors are 5 times the noise, though 5 descents agree"),
+        (5, 5e-4, 1e-4, "held-out errors are 5 times the noise, although 5 starts agree"),
         (5, 5e-4, None, ""),
     ]:
         known = None if noise is None else np.full(2, noise)

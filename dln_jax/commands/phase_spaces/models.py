@@ -143,7 +143,7 @@ def choose_model(
     )
     left = "; ".join(names[len(trials) :])
     title = "candidates, by errors of rates on validation motions"
-    say_selection(context, title, names[chosen.candidate], left and f"left out are {left}", rows)
+    say_selection(context, title, names[chosen.candidate], left and f"{left} not tried", rows)
     return chosen.outcome
 
 

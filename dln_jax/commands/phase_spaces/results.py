@@ -18,7 +18,7 @@ from dln_jax.metrics.latency import one_step
 from dln_jax.metrics.phase_space import Motions, energies, field_errors, field_rates, motion_errors, predict
 from dln_jax.metrics.predictions import on_grid, padded, predict_measured, prediction_metrics
 from dln_jax.metrics.verdict import judge_motions, quarter_period
-from dln_jax.runs.report import Report, one_step_metrics, png, unit_of
+from dln_jax.runs.report import Report, one_step_metrics, png, rows_of
 from dln_jax.zoo.run import Run
 
 SUBSTEPS = 4
@@ -30,27 +30,27 @@ LOSSES = {
 }
 """Label of the loss of every stage."""
 RATE_UNITS = "units of qd² and pd²"
-OVER_STARTS = {"": "", "_standard_error": ": its standard error over starts", "_median": ": its median over starts"}
+OVER_STARTS = {"": "", "_standard_error": ", standard error over starts", "_median": ", median over starts"}
 METRICS = {
     **{
-        f"{name}{ending}": (f"{label}, mean square error{words}", unit)
+        f"{name}{ending}": (f"{label} of predicted motions{words}", unit)
         for name, label, unit in (
-            ("energy_mse", "energy along predicted motions", "J²"),
-            ("published_energy_mse", "published energy along predicted motions", "units of that energy²"),
-            ("rollout_mse", "(q, p) of predicted motions", "units of q² and p²"),
+            ("energy_mse", "energy MSE", "J²"),
+            ("published_energy_mse", "published energy MSE", "units of that energy²"),
+            ("rollout_mse", "(q, p) MSE", "units of q² and p²"),
         )
         for ending, words in OVER_STARTS.items()
     },
-    "vpt_seconds": ("time of correct prediction of motions", "s"),
-    "vpt_median_seconds": ("time of correct prediction of motions: its median", "s"),
-    "predicted_seconds": ("duration of the predicted motions", "s"),
-    "vpt_lyapunov": ("time of correct prediction of motions, in Lyapunov times of the model", "1"),
+    "vpt_seconds": ("valid prediction time, mean", "s"),
+    "vpt_median_seconds": ("valid prediction time, median", "s"),
+    "predicted_seconds": ("length of the predicted motions", "s"),
+    "vpt_lyapunov": ("valid prediction time, in Lyapunov times of the model", "1"),
     "lyapunov_seconds": ("Lyapunov time of the model", "s"),
-    "energy_drift": ("energy error along predicted motions, over the largest kinetic energy", "1"),
-    "train_loss": ("(qd, pd) at training states, mean square error", RATE_UNITS),
-    "test_loss": ("(qd, pd) at test states, mean square error", RATE_UNITS),
-    "clean_field_mse": ("(qd, pd) against the exact field, mean square error", RATE_UNITS),
-    "validation_error": ("validation loss of the last stage", "see training.png"),
+    "energy_drift": ("energy error of predicted motions over the largest kinetic energy", "1"),
+    "train_loss": ("(qd, pd) MSE at training states", RATE_UNITS),
+    "test_loss": ("(qd, pd) MSE at test states", RATE_UNITS),
+    "clean_field_mse": ("(qd, pd) MSE against the exact field", RATE_UNITS),
+    "validation_error": ("validation loss of the last stage", "as in training.png"),
 }
 """Label and unit of a metric by its name; other names say them. The true plant has an energy error of 0."""
 UNITS = {"revolute": ("rad", "kg m²/s"), "prismatic": ("m", "kg m/s")}
@@ -86,14 +86,11 @@ def evaluate(log: PhaseLog, fit: PhaseFit) -> Report:
         metrics |= {f"q{joint}_noise": float(sd) for joint, sd in enumerate(np.ravel(log.noise.q), start=1)}
     metrics["validation_error"] = float(fit.training.validation)
     metrics = {key: value for key, value in metrics.items() if np.isfinite(value)}
-    rows = []
-    for key, value in metrics.items():
-        label, unit = METRICS.get(key, (key.replace("_", " "), unit_of(key, {})))
-        rows.append((label, f"{value:.4g}", unit))
+    labels, units = ({name: words[k] for name, words in METRICS.items()} for k in range(2))
     failed = fit.stop == "not finite"
     return Report(
         metrics=metrics | {"verdict": verdict.number},
-        rows=rows,
+        rows=rows_of(metrics, labels, units),
         title=f"test motions of {log.name}, f64",
         verdict=verdict,
         figures=figures_of(log, fit, predicted[0], rates),
