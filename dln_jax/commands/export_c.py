@@ -1,11 +1,12 @@
-"""Export the model of a run as C99 source without dependencies: header, source, a demo and a CMake file.
+"""Export the model of a run as C99 source.
 
-The run is one of a training command. The functions take one state, in SI units. A model of dynamics has inverse and
-forward dynamics, gravity, Coriolis force, friction, mass matrix, energy, integration steps x_next = F(x, u, dt), and
-the exact derivatives of all of them. A model of a phase space has rates and steps; a differential network has its
-value, Jacobian and Hessian. Without --functions, all functions are exported except those that take long to compile.
-The C code does not allocate memory and keeps no state. dln_jax.load_c compiles it and calls it from Python;
-dln_jax.export_c exports any other JAX function.
+The run comes from a training command. The export has a header, a source, a demo program and a CMake file, and depends
+on nothing but <math.h>. The functions take one state, in SI units. A model of dynamics has inverse and forward
+dynamics, gravity, Coriolis force, friction, mass matrix, energy, integration steps x_next = F(x, u, dt), and the exact
+derivatives of all of them. A model of a phase space has rates and steps; a differential network has its value,
+Jacobian and Hessian. Without --functions, all functions are exported except those that take long to compile. The C code
+allocates no memory and keeps no state. dln_jax.load_c compiles it and calls it from Python; dln_jax.export_c exports
+any other JAX function.
 """
 
 import itertools

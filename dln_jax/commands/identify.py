@@ -1,9 +1,9 @@
-"""Identify a robot from its URDF or MJCF file and a log of q, qd, qdd and tau.
+"""Identify a robot from its URDF or MJCF file and a log.
 
-Finds base parameters with standard errors, friction, and physically consistent parameters, and states what the data do
-not determine. A run folder gets config.json, metrics.json, the model (load it with dln_jax.load, or export it to C),
-report.txt and parameters.json, the robot's file with the identified values, and figures. Held-out trajectories judge
-the result, or blocks of time if there is only one trajectory.
+Fits base parameters with standard errors, friction, and physically consistent inertias to q, qd, qdd and tau, and
+reports what the data do not determine. The run folder gets the model (load it with dln_jax.load, or export it to C),
+the robot's file with the identified values, report.txt, parameters.json, metrics.json, config.json and figures.
+Held-out trajectories judge the result, or held-out blocks of time if there is only one trajectory.
 """
 
 from dataclasses import dataclass

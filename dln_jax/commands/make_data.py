@@ -1,7 +1,8 @@
-"""Generate trajectories of a textbook scene, with exact rates, torques and force decomposition, as an npz file.
+"""Generate trajectories of a textbook system as npz.
 
-Kinds: `characters` (the two-link arm writes 20 letters), `uniform` (independent random states in a box), and
-`free-swing` (motions from rest without torque, integrated to 1e-10).
+The file has exact rates, torques and a decomposition of the forces. Kinds: `characters` (the two-link arm writes 20
+letters), `uniform` (independent random states in a box), and `free-swing` (motions from rest without torque, integrated
+to 1e-10).
 """
 
 from dataclasses import dataclass

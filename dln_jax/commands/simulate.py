@@ -1,14 +1,15 @@
-"""Simulate a soft body by implicit time steps: a cantilever, a twisted bar, a sliding block, a falling body, a crawler.
+"""Simulate a soft body with implicit time steps.
 
-Prints the speed and how well the steps were solved, and writes a run folder: motion.gif, energy.png (energies against
-time, which show what the implicit step damps), moments.png, metrics.json, report.json and config.json. Bodies have
-1000 kg/m³; in the plane they are 1 m thick.
+Scenes: a cantilever, a twisted bar, a sliding block, a falling body and a crawler. Prints the speed and how accurately
+the steps were solved. The run folder gets motion.gif, energy.png (energies against time, which show what the implicit
+step damps), moments.png, metrics.json, report.json and config.json. The density is 1000 kg/m³; bodies in the plane are
+1 m thick.
 
-Your own mesh: --mesh FILE for the scenes beam and drop, with the last axis up. Formats: .msh of Gmsh (2.2 and 4.1)
-and, with the extra [mesh], .vtk, .vtu, .obj and TetGen's .ele. Tetrahedra form a body in space, triangles with constant
-z a body in the plane; physical groups become named sets, for --pin. The command prints what it left out or repaired.
-An .npz has `vertices` [n, 2 or 3] in m, `elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0) and, for the
-beam, optionally `held` [k] (vertices; by default those of the smallest x).
+For your own mesh, add --mesh FILE to the scenes beam and drop; its last axis points up. Formats: .msh of Gmsh (2.2 and
+4.1) and, with the extra [mesh], .vtk, .vtu, .obj and TetGen's .ele. Tetrahedra form a body in space, triangles with
+constant z a body in the plane. Physical groups become named sets, for --pin. The command prints what it left out or
+repaired. An .npz has `vertices` [n, 2 or 3] in m, `elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0) and,
+for the beam, optionally `held` [k] (vertices; by default those with the smallest x).
 """
 
 import dataclasses

@@ -1,10 +1,11 @@
-"""Run one command over a grid of its options, each combination as a job of its own, here, by Slurm or by Ray.
+"""Run a command for every combination of options.
 
-The grid is for example 'width=8,16 seed=0:10 data=a.npz,b.npz': commas separate values, a:b and a:b:step are whole
-numbers without b, and all combinations run. Options are checked before anything starts. A sweep's folder gets a folder
-for each job, table.csv with all their metrics, sweep.json and sweep.png: error against seconds, and the best by
-validation alone. Jobs that fail are listed with their error message, and the exit status is 1; --resume runs only the
-jobs that are not done. slurm needs the extra [sweep], ray the extra [ray]; hosts must share the sweep's folder.
+Jobs run on this machine, or with Slurm or Ray. An example of a grid is 'width=8,16 seed=0:10 data=a.npz,b.npz': commas
+separate values, and a:b and a:b:step are whole numbers below b. Options are checked before anything starts. The folder
+of the sweep gets a folder for each job, table.csv with all metrics, sweep.json and sweep.png, which shows error against
+seconds and marks the best job by validation. Failed jobs are listed with their error message, and the exit status is 1;
+--resume runs only the unfinished jobs. Slurm needs the extra [sweep], Ray the extra [ray], and all hosts must share the
+sweep's folder.
 """
 
 import importlib
@@ -16,7 +17,7 @@ from typing import ClassVar, Literal
 from dln_jax.commands import COMMANDS
 from dln_jax.errors import InputError
 from dln_jax.options import Resumable, Unstated
-from dln_jax.runs.arguments import names_in, require_positive_if_given
+from dln_jax.runs.arguments import closest, names_in, require_positive_if_given
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Arguments(Resumable):
 def main(options: Arguments) -> None:
     """Checks the grid, runs the jobs and shows the results; raises `SystemExit` with 1 if a job is not done."""
     from dln_jax.commands.sweeps.executors import cores, here, ray, run, slurm
-    from dln_jax.commands.sweeps.jobs import closest, grid_of, jobs_of, pairs, status_of
+    from dln_jax.commands.sweeps.jobs import grid_of, jobs_of, pairs, status_of
     from dln_jax.commands.sweeps.results import compare, print_results, sweep_figure, write_tables
     from dln_jax.files import write_figure
     from dln_jax.runs.folder import command_folder
@@ -74,7 +75,7 @@ def main(options: Arguments) -> None:
     command, known = options.command.replace("-", "_"), [name for name in COMMANDS if name != "sweep"]
     if command not in known:
         like = closest(command, known)
-        raise InputError(f"--command: there is no {command!r:.40}{like} (see python -m dln_jax --help)")
+        raise InputError(f"--command: there is no {command!r:.40}{like} (see dln-jax --help)")
     arguments = importlib.import_module(f"dln_jax.commands.{command}").Arguments
     jobs_of(command, arguments, grid, fixed, Path())  # mistakes are refused before there is a folder
     at_once = options.jobs or (None if where == "slurm" else options.gpus or cores())

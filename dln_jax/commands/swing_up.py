@@ -1,13 +1,14 @@
-"""Swing up a pole with a model that was learned from it: explore the plant, learn, design a controller, close the loop.
+"""Swing up a pole with a model learned from its motion.
 
-The plant is an MJCF or URDF file: a cart-pole, a rotary pendulum, an acrobot, a pendubot, or another chain with a
-passive joint; cart-pole and rotary-pendulum name two files of the library, desktop plants with dry friction. MuJoCo
-simulates it, with encoders and torques that act a sample late. It is explored without a model; only q and the commanded
-torques are recorded. Models: identified (rigid bodies, linear in its parameters), delan (a structured deep Lagrangian
-network with friction), known (the file's bodies and friction), analytic (the same without friction). Trials of the
-model choose all gains, and the law gets its states from a Kalman filter of the model.
+Explores the plant, learns a model, designs a controller, and closes the loop. The plant is an MJCF or URDF file: a
+cart-pole, a rotary pendulum, an acrobot, a pendubot, or another chain with a passive joint. cart-pole and
+rotary-pendulum name two files of the library, desktop plants with dry friction. MuJoCo simulates the plant, with
+encoders and torques that act one sample late. The exploration needs no model and records only q and the commanded
+torques. Models: identified (rigid bodies, linear in their parameters), delan (a structured deep Lagrangian network with
+friction), known (the file's bodies and friction), analytic (the same without friction). Simulated trials choose all
+gains, and a Kalman filter estimates the states.
 
-A run folder gets data.npz, the model, law.json, metrics.json, config.json, and a figure of the runs.
+The run folder gets data.npz, the model, law.json, metrics.json, config.json, and a figure of the runs.
 """
 
 from dataclasses import dataclass

@@ -1,9 +1,10 @@
-"""Train a model of dynamics on trajectories (q, qd, qdd, tau), and report its errors, its rollouts and its speed.
+"""Train a model of dynamics on a log with torques.
 
 Models: structured-delan (a deep Lagrangian network, M = L Lᵀ), black-box-delan (a network is the Lagrangian),
-trigonometric (linear in its parameters), trigonometric-kernel (the same as a Gaussian process), learned-tree (an arm's
-bodies and joint frames), feed-forward (no physics), auto (model selection). --model NAME --help shows the options of a
-model. Without --data, a two-link arm writes 20 letters. Load the run with dln_jax.load.
+trigonometric (linear in its parameters), trigonometric-kernel (the same as a Gaussian process), learned-tree (rigid
+bodies with unknown joint frames), feed-forward (no physics), auto (model selection). --model NAME --help shows the
+options of a model. Without --data, a two-link arm writes 20 letters. The table reports errors, rollouts and speed. Load
+the run with dln_jax.load.
 """
 
 import dataclasses
@@ -182,8 +183,6 @@ def train(options: Options, command: str) -> None:
             fit.save(folder)
         report = evaluate(fit, parts, log, mesh=mesh)
         limited = seconds is not None or (isinstance(options, Network) and options.steps is not None)
-        if report.error:
-            report = report._replace(error=report.error.replace("the model", str(folder), 1))
         finish(folder, options, report._replace(ended_by_user=fit.optimiser is not None and limited))
 
 

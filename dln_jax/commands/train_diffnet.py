@@ -1,8 +1,10 @@
-"""Train a deep differential network, or an ensemble, on a function: value, gradient and Hessian from one pass.
+"""Train a network on a function and its derivatives.
 
-Functions: sin (1-D), cos_sin (cos x1 sin x2), both with the published noise, or your own npz file with x [N, n],
-y [N, m] and optional dy, d2y. A run folder gets config.json, metrics.json, model.safetensors and model.json (load them
-with dln_jax.load), and figures. `python -m scripts.report diffnet table` has the published activations and losses.
+A deep differential network, or an ensemble of them, gives value, gradient and Hessian in one pass. Functions: sin
+(1-D) and cos_sin (cos x1 sin x2), both with the published noise, or your own npz file with x [N, n], y [N, m] and
+optional dy, d2y. The run folder gets config.json, metrics.json, model.safetensors and model.json (load them with
+dln_jax.load), and figures. In the repository, `python -m scripts.report diffnet table` compares the published
+activations and losses.
 """
 
 from dataclasses import dataclass
@@ -97,14 +99,12 @@ def main(options: Arguments) -> None:
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import Report, cost_metrics, finish, png, rows_of
     from dln_jax.scale import device_lines
-    from dln_jax.types import require_seed
     from dln_jax.zoo.descriptions import describe
     from dln_jax.zoo.run import load as load_run
     from dln_jax.zoo.run import save
 
     # The samples
     mesh = mesh_of(options)
-    require_seed(options.seed)
     function, seed, is_named = options.function, options.seed, options.function in NAMES
     newton, several = options.optimizer == "gauss-newton", options.ensemble > 1
     sampling, box, remarks = {}, None, ()

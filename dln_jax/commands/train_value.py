@@ -1,13 +1,14 @@
-"""Train a value function: the cost to go of a plant as a network, whose slope is the best control in closed form.
+"""Train a value function and its optimal control law.
 
-Trains by fitted value iteration, or on the residual of the Hamilton-Jacobi-Bellman equation, prints how long that took
-and what the law costs from 100 starts near hanging and 100 anywhere, and writes a run folder: value.safetensors and
-value.json (dln_jax.load(folder).value), metrics.json, config.json, and figures of V and of the
-closed loop. --out FOLDER --resume continues an interrupted run.
+The value function is the cost to go of a plant as a network, whose gradient gives the optimal control. It is trained by
+fitted value iteration, or on the residual of the Hamilton-Jacobi-Bellman equation. The table reports the training time
+and the cost of the law from 100 starts near hanging and 100 anywhere. The run folder gets value.safetensors and
+value.json (dln_jax.load(folder).value), metrics.json, config.json, and figures of V and of the closed loop. --out
+FOLDER --resume continues an interrupted run.
 
 --plant takes the name of a desktop plant or an MJCF or URDF file, and --run the folder of a learned or identified
-model. Costs, box and times come from the plant's natural scales and limits, and are printed. A law that does not bring
-its starts up is refused with exit status 1, unless your own --iterations ended the training.
+model. Costs, box and times follow from the plant's natural scales and limits, and are printed. A law that fails to
+bring its starts upright is refused with exit status 1, unless your own --iterations ended the training.
 """
 
 from collections.abc import Mapping

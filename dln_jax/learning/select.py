@@ -134,7 +134,7 @@ def say_selection(context: Context, title: str, kept: str, ended: str, rows: Seq
         rows: a dictionary for each candidate, with its `name`; lists and texts are not shown.
     """
     shown = [key for key in dict.fromkeys(itertools.chain(*rows)) if key not in ("name", "joints", "reason")]
-    table = Table("model", *(key.replace("_", " ") for key in shown), "", title=title)
+    table = Table("model", *(key.replace("_", " ").replace("mse", "MSE") for key in shown), "", title=title)
     for row in rows:
         values = (row.get(key) for key in shown)
         numbers = [

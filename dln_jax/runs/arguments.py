@@ -155,8 +155,13 @@ def _unknown(option: str, arguments: type) -> str:
             if negated in {field.name for field in dataclasses.fields(kind)}:
                 return f"{option} is an option of {words}; add that, or leave {option} out"
     names = [f"--{field.name.replace('_', '-')}" for kind in (arguments, *known) for field in dataclasses.fields(kind)]
-    like = difflib.get_close_matches(option, names, n=1)
-    return f"unrecognised option: {option:.80}" + (f"; did you mean {like[0]}?" if like else "")
+    return f"unrecognised option: {option:.80}{closest(option, names)}"
+
+
+def closest(word: str, known: Sequence[str]) -> str:
+    """Returns "; did you mean WORD?" for the known word closest to a misspelt one, or nothing."""
+    like = difflib.get_close_matches(word, known, n=1)
+    return f"; did you mean {like[0]}?" if like else ""
 
 
 def names_listed(text: str | None) -> tuple[str, ...]:

@@ -124,11 +124,6 @@ def copied_folder(options: Any, resume: bool) -> Iterator[Path]:
             raise KeyboardInterrupt(options.out) from None
 
 
-def enable_double_precision() -> None:
-    """Turns on float64 for data and references."""
-    jax.config.update("jax_enable_x64", True)
-
-
 def keep_programs(wanted: bool) -> str:
     """Turns the cache on or off. Returns the reason if it cannot be turned on, else an empty string.
 
@@ -177,9 +172,8 @@ def print_compilation() -> None:
     if not compilation.cache_info().currsize:
         return
     seconds, cached, unkept, last = compilation().values()
-    many = {0: "no program", 1: "one program"}.get(cached, f"{cached} programs")
     why = f" (none is kept: {unkept})" if unkept else ""
-    line = f"compilation took {seconds:.1f} s; {many} came from the cache{why}"
+    line = f"compilation took {seconds:.1f} s; programs from the cache: {cached}{why}"
     if (seconds >= 0.5 or cached) and line != last:
         print(line)
         compilation()["line"] = line

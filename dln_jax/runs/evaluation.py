@@ -70,22 +70,19 @@ LABELS = {
     "rollout_seconds": "length of a test motion",
     "normalised_state_error": "normalised state error of a rollout",
     "energy_error_j": "energy balance error of a rollout",
-    "descents": "starts of the search",
     "descents_agreeing": "starts that reached the lowest loss",
-    "twin_degrees": "angle between axes of the best starts",
-    "twin_metres": "distance between axes of the best starts",
+    "descents": "starts of the search",
+    "twin_degrees": "angle between axes of the best starts, degrees",
+    "twin_metres": "distance between axes of the best starts, m",
     "twin_error": "ratio of the errors of the best starts",
     "error_over_noise": "MSE over the noise variance",
-    "calls_per_second": "calls of the inverse model",
 }
 """Labels of metrics whose names do not explain themselves."""
 UNITS = {
+    "nmse": "1",
     "power_mse": "W²",
     "normalised_state_error": "1",
     "energy_error_j": "J",
-    "twin_degrees": "°",
-    "twin_metres": "m",
-    "calls_per_second": "1/s",
 }
 """Units of metrics other than times and errors of forces."""
 CHUNK = 256
@@ -244,9 +241,8 @@ def table_of(metrics: dict[str, float | int], fit: Fit) -> tuple[tuple[str, ...]
     """Columns and rows of the printed table; rollout metrics also show the true plant's values, if it is known."""
     force = "(N m)²" if set(fit.needs.joints) == {"revolute"} else "(N m or N)²"
     own = {name: value for name, value in metrics.items() if name not in (*CEILINGS.values(), "verdict")}
-    own["calls_per_second"] = round(1e6 / metrics["one_step_p50_us"])
-    units = {name: "1" if "nmse" in name else force for name in own if "mse" in name} | UNITS
-    units["forward_mse"] = force.replace("N m", "rad/s²").replace("N", "m/s²")
+    acceleration = force.replace("N m", "rad/s²").replace("N", "m/s²")
+    units = {**UNITS, "forward_mse": acceleration, "mse": force}
     units["validation_error"] = force if fit.objective.selects_by == "torque" else "1"
     true = [metrics.get(CEILINGS.get(name, "")) for name in own]
     known = any(number is not None for number in true)

@@ -28,10 +28,8 @@ CHOSEN = "chosen"
 """Key in config.json of values derived from the arguments."""
 FILES = "files"
 """Key in config.json of the SHA-256 digests of input files, by argument name."""
-SCALE = ("devices", "processes", "coordinator", "process_id")
-"""Arguments that state where a result is computed."""
-PLACES = ("out", "resume", "figures", "uncertainty", *SCALE)
-"""Arguments that do not affect the result."""
+PLACES = ("out", "resume", "figures", "uncertainty", "devices", "processes", "coordinator", "process_id")
+"""Arguments that do not affect the result, such as where it is computed."""
 CHANGEABLE = ("seconds",)
 """Arguments that may change with --resume; a class of arguments may list more in its own `CHANGEABLE`."""
 REMEDY = "restore the file, or train again into another folder"

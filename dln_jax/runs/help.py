@@ -73,17 +73,17 @@ def options_of(arguments: type) -> list[tuple[str, str, str]]:
         usage, default = f"--{field.name.replace('_', '-')}", field.default
         stated = next((mark for mark in marks if hasattr(mark, "metavar")), None)
         kind = get_args(hints[field.name])[0] if marks else hints[field.name]
+        text = stated.help if stated and stated.help else texts[field.name]
         hint = f" (default: {default})"
-        if kind is bool:
-            usage, hint = usage if not default else f"--no-{usage[2:]}", " (default: on)" if default else ""
-        elif default is dataclasses.MISSING:
-            hint = " (required)"
-        elif default is None or (stated and stated.help_behavior_hint == ""):
-            hint = ""
         if kind is not bool:
             usage += f" {stated.metavar if stated and stated.metavar else _metavar(kind)}"
-        text = stated.help if stated and stated.help else texts.get(field.name, "")
-        options.append((field.name, usage, text + hint))
+        elif default is True:
+            usage, text = f"--no-{usage[2:]}", f"Do not {text[0].lower()}{text[1:]}"
+        if default is dataclasses.MISSING:
+            hint = " (required)"
+        elif default is None or kind is bool or (stated and stated.help_behavior_hint == ""):
+            hint = ""
+        options.append((field.name, usage, f"{text.rstrip('.')}{hint}."))
     return options
 
 

@@ -73,7 +73,7 @@ def finish(folder: Path, options: Any, report: Report) -> None:
     if verdict is not None:
         print(verdict.line)
     if report.error:
-        raise InputError(report.error)
+        raise InputError(f"{folder}: {report.error}")
     if refused and not report.ended_by_user:
         raise FitRefused(verdict)
 
@@ -86,8 +86,8 @@ def print_numbers(
     width: int | None = None,
 ) -> None:
     """Prints a table of quantities, their values and units, `width` columns wide (default: the terminal's)."""
-    justify = {"quantity": "left", "joint": "left", "unit": "left", "status": "left"}
-    table = Table(*(Column(column, justify=justify.get(column, "right")) for column in columns), title=title)  # type: ignore
+    left = ("quantity", "joint", "unit", "status")
+    table = Table(*(Column(column, justify="left" if column in left else "right") for column in columns), title=title)
     for row in rows:
         table.add_row(*row)
     Console(highlight=False, soft_wrap=True, width=width).print(table)
@@ -98,25 +98,36 @@ LABELS = {
     "compile_seconds": "compilation time",
     "one_step_p50_us": "latency of one call, median",
     "one_step_p99_us": "latency of one call, 99th percentile",
+    "_seconds": " time",
+    "_median": ", median",
+    "mse": "MSE",
+    "_": " ",
 }
-"""Labels of metrics that several commands have."""
+"""Words for parts of metrics' names."""
+
+
+def label_of(name: str, labels: Mapping[str, str] = {}) -> str:
+    """The name of a metric or an option in words: those of `labels` for parts of it, then those of `LABELS`."""
+    for part, words in {**labels, **LABELS}.items():
+        name = name.replace(part, words)
+    return name
 
 
 def rows_of(
     metrics: Mapping[str, float | int], labels: Mapping[str, str] = {}, units: Mapping[str, str] = {}
 ) -> list[tuple[str, str, str]]:
-    """Rows of the printed table: label, value and unit of every metric.
+    """Rows of the printed table: label, value and unit of every metric but the verdict, which is printed in words.
 
     Args:
-        labels: labels of metrics whose names do not explain themselves.
-        units: units of metrics; those of times follow from the name.
+        labels: as for `label_of`.
+        units: units by a part of the name; the first that occurs counts, and times have one of their own.
     """
-    labels, rows = {**LABELS, **labels}, []
+    rows = []
     for name, value in metrics.items():
-        label = name.replace("_seconds", " time").replace("mse", "MSE").replace("_", " ")
-        unit = "s" if name.endswith("_seconds") else "µs" if name.endswith("_us") else ""
-        shown = f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
-        rows.append((labels.get(name, label), shown, units.get(name, unit)))
+        unit = next(unit for part, unit in {**units, "_seconds": "s", "_us": "µs", "": ""}.items() if part in name)
+        if name != "verdict":
+            whole = float(value).is_integer() and abs(value) < 1e9
+            rows.append((label_of(name, labels), f"{value:,.0f}" if whole else f"{value:.4g}", unit))
     return rows
 
 

@@ -19,8 +19,6 @@ MOST_CHARACTERS = 400
 """Characters shown at either end of a long message; the middle is left out."""
 INTERRUPTED = 130
 """Exit status after an interrupt, as shells have it."""
-LARGEST_SEED = 2**32 - 1
-"""Largest seed of NumPy and JAX."""
 
 
 def run(
@@ -54,13 +52,15 @@ def run(
             sys.stdout.flush()  # the help; raises BrokenPipeError here if its reader has closed the pipe
         require_possible(own)
         # JAX takes a second to import, which the help and a mistake do not need.
+        import jax
+
         from dln_jax.runs import devices
         from dln_jax.runs.folder import require_free, with_stored_arguments
         from dln_jax.runs.progress import heartbeat
         from dln_jax.scale import losses_named
 
         # Data and references are float64; models state their own precision.
-        devices.enable_double_precision()
+        jax.config.update("jax_enable_x64", True)
         member = devices.membership_in(own) if isinstance(own, Scaled) else None
         if getattr(own, "resume", False):
             options = with_stored_arguments(own, arguments)
@@ -161,6 +161,8 @@ def interrupted(command: str, options: Any, folder: Path | None = None) -> str:
 
 def require_possible(options: Any) -> None:
     """Raises `InputError` for an option that is not finite or is implausibly large."""
+    from dln_jax.types import require_seed  # imports JAX
+
     counts = {}
     for name, value in dataclasses.asdict(options).items():
         option = f"--{name.replace('_', '-')}"
@@ -169,8 +171,7 @@ def require_possible(options: Any) -> None:
                 raise InputError(f"{option} is {value}; expected a finite number, or leave it out")
             require_magnitude(option, value)
         elif isinstance(value, int) and name == "seed":
-            if not 0 <= value <= LARGEST_SEED:
-                raise InputError(f"seed is {value}; expected whole numbers from 0 to {LARGEST_SEED}")
+            require_seed(value, getattr(options, "seeds", 1))
         elif isinstance(value, int):
             counts[option] = value
     require_within(counts)

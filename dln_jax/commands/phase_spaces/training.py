@@ -211,7 +211,10 @@ def train(
     if stop == "not finite":
         remedy = "state the plant's --needs, try another --model"
         remedy = "lower --learning-rate" if isinstance(optimiser, Adam) else remedy
-        remark = f"the loss stopped being finite {at}; {remedy}, or look for very large numbers in the data"
+        remark = (
+            f"the loss stopped being finite {at}; the model is the last good one; {remedy}, or check the data for huge "
+            "numbers"
+        )
     training = done.get(MOTIONS, first)
     if not np.isfinite(training.validation):
         raise InputError(remark or "no validation error is finite; look for very large numbers in the data")

@@ -5,7 +5,6 @@ own process; a status file in its folder records how it ended.
 """
 
 import dataclasses
-import difflib
 import itertools
 import math
 import re
@@ -24,7 +23,7 @@ from filelock import FileLock
 
 from dln_jax.files import as_type, is_file, read_json, write_json
 from dln_jax.options import CompilationCache
-from dln_jax.runs.arguments import arguments_for, pairs_of, parse
+from dln_jax.runs.arguments import arguments_for, closest, pairs_of, parse
 from dln_jax.runs.folder import CONFIG, LOCK
 from dln_jax.runs.running import INTERRUPTED
 from dln_jax.types import InputError
@@ -263,9 +262,3 @@ def jobs_of(
         line = (*common, *(words[name][text] for name, text in values.items()))
         jobs.append(Job(folder / "jobs" / f"{number:04}", command, line, values, "resume" in types, Path.cwd()))
     return jobs
-
-
-def closest(word: str, known: Sequence[str]) -> str:
-    """ "; did you mean WORD?" for the known word closest to an unknown one, or nothing."""
-    like = difflib.get_close_matches(word, known, n=1)
-    return f"; did you mean {like[0]}?" if like else ""

@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from dln_jax.commands.sweeps.jobs import METRICS, Job, status_of
 from dln_jax.figures import style
 from dln_jax.files import as_type, finite, is_file, read_json, write_bytes, write_json
-from dln_jax.runs.report import print_numbers
+from dln_jax.runs.report import label_of, print_numbers
 from dln_jax.types import InputError
 
 COMPARED = {
@@ -130,16 +130,16 @@ def problem_of(values: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
 
 
 def print_results(results: Mapping[str, Any], command: str, folder: Path) -> None:
-    """Prints all jobs, their medians, the best jobs, the jobs that are not done, and the sweep's folder.
+    """Prints all jobs, their medians, the unfinished jobs, the sweep's folder, and the best jobs.
 
-    A long sweep shows only the best jobs and the ones that are not done.
+    A long sweep shows only the best and the unfinished jobs.
     """
     rows, over, names = results["jobs"], results["over"], results["names"]
     best, missed = [row for row in rows if row["best"]], [row for row in rows if row["state"] != "done"]
     listed, title = rows, f"{command}, {len(rows)} jobs"
     if len(rows) > MOST_ROWS:
         listed = [row for row in rows if row["best"] or row["state"] != "done"][:MOST_ROWS]
-        title = f"{title} (the best, and those that are not done; all are in table.csv)"
+        title = f"{title} (the best and the unfinished; table.csv has all)"
     table = []
     for row in listed:
         numbers = {name: row["metrics"].get(name) for name in filter(None, names.values())}
@@ -158,18 +158,18 @@ def print_results(results: Mapping[str, Any], command: str, folder: Path) -> Non
         print_rows(f"medians over {', '.join(over)}, and the worst", table)
     if results["metrics"] and names["validation"] is None:
         known = ", ".join(sorted(results["metrics"]))
-        print(f"no job has a validation error: none is chosen; --metric takes one of {known}")
-    for row in best:
-        values = " ".join(f"{name}={text}" for name, text in row["values"].items())
-        print(f"best by {names['validation']}: {values}, run folder {folder / 'jobs' / row['job'] / row['run']}")
-    if best and names["error"] in COMPARED["error"]:
-        print(f"{names['error']} is of the test, and took no part in the choice")
+        print(f"no job has a validation error, so none is the best; choose a --metric from {known}")
     if missed:
         print(unfinished(rows))
         for (state, line), part in classes(missed, lambda row: (row["state"], row["line"])).items():
             print(f"  {', '.join(row['job'] for row in part)} {state}: {line}")
-        print(f"--out {folder} --resume does them again")
+        print(f"--out {folder} --resume runs them again")
     print(f"sweep: {folder}")
+    if best and names["error"] in COMPARED["error"]:
+        print(f"{names['error']} is measured on the test set and did not influence the choice")
+    for row in best:
+        values = " ".join(f"{name}={text}" for name, text in row["values"].items())
+        print(f"best by {names['validation']}: {values}, run folder {folder / 'jobs' / row['job'] / row['run']}")
 
 
 def print_rows(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -178,7 +178,7 @@ def print_rows(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
         [f"{cell:.3g}" if isinstance(cell, float | int) else shortened(cell or "") for cell in row.values()]
         for row in rows
     ]
-    print_numbers(cells, title=title, columns=[spaced(name) for name in (rows[0] if rows else ())], width=WIDTH)
+    print_numbers(cells, title=title, columns=[label_of(name) for name in (rows[0] if rows else ())], width=WIDTH)
 
 
 def write_tables(folder: Path, results: Mapping[str, Any]) -> None:
@@ -212,11 +212,6 @@ def unfinished(rows: Sequence[Mapping[str, Any]]) -> str:
 def shortened(text: str) -> str:
     """A value for a table; a path is shortened to its last part."""
     return Path(text).name
-
-
-def spaced(name: str) -> str:
-    """A metric or an option in words."""
-    return name.replace("_", " ").replace("mse", "MSE")
 
 
 def sweep_figure(results: Mapping[str, Any], at_once: int | None) -> Figure | None:
@@ -263,11 +258,10 @@ def sweep_figure(results: Mapping[str, Any], at_once: int | None) -> Figure | No
         axis.set_yscale(style.scale_of(y for _, _, y, _ in here))
         style.title(axis, ", ".join(f"{name} {shortened(text)}" for name, text in problem))
     beside = "" if at_once is None else f", {at_once} jobs at once" if at_once > 1 else ", one job at a time"
-    work = seconds.removesuffix("_seconds").replace("train", "training")
     for axis in axes.flat[max(0, len(problems) - columns) : len(problems)]:
-        axis.set_xlabel(f"{work}, s{beside}")
+        axis.set_xlabel(f"{label_of(seconds)}, s{beside}")
     for axis in axes[:, 0]:
-        axis.set_ylabel("test " * (error in COMPARED["error"]) + spaced(error))
+        axis.set_ylabel("test " * (error in COMPARED["error"]) + label_of(error))
 
     def handle(marker: str, label: str, **looks: Any) -> Line2D:
         return Line2D([], [], marker=marker, label=label, **{"linestyle": "", "color": "0.4", **looks})
@@ -275,9 +269,9 @@ def sweep_figure(results: Mapping[str, Any], at_once: int | None) -> Figure | No
     handles = []
     if colour:
         few = kinds[:: -(-len(kinds) // MOST_COLOURS)]
-        handles += [handle("s", f"{spaced(colour)} {kind}", color=colours[kind]) for kind in few]
+        handles += [handle("s", f"{label_of(colour)} {kind}", color=colours[kind]) for kind in few]
     if marker:
-        handles += [handle(markers[form], f"{spaced(marker)} {form}") for form in forms]
+        handles += [handle(markers[form], f"{label_of(marker)} {form}") for form in forms]
     if over:
         handles += [handle("o", "a run", **RUN), handle("o", "median", **MEDIAN)]
     if any(row["best"] for row in rows):

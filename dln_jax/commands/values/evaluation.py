@@ -27,6 +27,20 @@ SHOWN, POINTS, LEVELS = 12, 121, 16
 """Number of runs drawn, of nodes along each side of the plane, and of contours of V."""
 RATE = 20.0
 """Integrator steps of a run per 1 / lambda."""
+LABELS = {
+    "down_": "from hanging: ",
+    "uniform_": "from anywhere: ",
+    "heavy_weak_": "heavy bodies, weak motors: ",
+    "light_strong_": "light bodies, strong motors: ",
+    "return_mean": "mean return",
+    "return_median": "median return",
+    "return_worst": "worst return",
+    "up_share": "share of starts that end upright",
+    "settled_median_seconds": "median time to settle",
+    "control_most": "largest control",
+    "value_error": "median relative error of V",
+}
+"""Words for parts of metrics' names."""
 
 
 def hinges_of(own: OwnProblem) -> list[int]:
