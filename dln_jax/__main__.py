@@ -49,13 +49,11 @@ def main() -> None:
     first = words[0] if words else "--help"
     try:
         if first in ("-h", "--help"):
-            print(
-                f"usage: {prog} COMMAND [OPTIONS]\n\n{prog} COMMAND --help lists the options with units and defaults\n\ncommands:"
-            )
+            print(f"usage: {prog} COMMAND [OPTIONS]\n\n{prog} COMMAND --help states units and defaults\n\ncommands:")
             width = max(map(len, COMMANDS))
             for name in COMMANDS:
                 print(f"  {name:{width}}  {first_line(name)}")
-            print("\nIn the repository, python -m scripts.report NAME repeats a benchmark of the project.", flush=True)
+            print("\nIn the repository, python -m scripts.report NAME repeats a benchmark.", flush=True)
             return
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

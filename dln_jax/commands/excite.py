@@ -25,7 +25,7 @@ class Arguments(Folder, Drawn):
     robot: Path
     """URDF or MJCF file; its meshes may be missing."""
     seconds: float = 20.0
-    """Length of each motion, which is its period, s."""
+    """Length of each motion and period of its series, s."""
     harmonics: int = 5
     """Harmonics of the series; the highest frequency is harmonics / seconds, Hz."""
     rate: float = 100.0
@@ -39,7 +39,7 @@ class Arguments(Folder, Drawn):
     velocity_scale: float = 0.05
     """Velocity at which dry friction has 76 % of its force, rad/s or m/s."""
     share: float = 0.9
-    """Share of every limit to use; the rest is left to the controller."""
+    """Fraction of every limit to use; the rest is left to the controller."""
     position: Unstated[str] = None
     """Half the range of positions about zero, rad or m (default: the file's)."""
     velocity: Unstated[str] = None
@@ -52,7 +52,7 @@ class Arguments(Folder, Drawn):
     """Comma-separated joints that may lack limits of position and torque; "*wheel*" matches all names that contain
     wheel. Positions are then limited to pi on either side (default: such joints are refused)."""
     noise: str = "1"
-    """Standard deviation of the torque's noise; only the ratios of joints matter."""
+    """Standard deviation of the torque noise; only the ratios of the joints matter."""
     height: Unstated[float] = None
     """Height of a plane, m; the origins of all moving links stay above it (default: no plane)."""
     payload: Unstated[float] = None

@@ -24,7 +24,7 @@ class Arguments:
     out: Path
     """File to write; its name ends in .npz."""
     scene: SceneName = "two-link-arm"
-    """The textbook system."""
+    """Textbook system."""
     kind: Literal["characters", "uniform", "free-swing"] = "characters"
     """How to sample the scene."""
     samples: Unstated[int] = None
@@ -36,7 +36,7 @@ class Arguments:
     dt: Unstated[float] = None
     """characters, free-swing: time between samples, s (default: 0.04 for characters, 0.02 for free-swing)."""
     seed: Unstated[int] = None
-    """uniform, free-swing: seed of all random numbers (default: 0)."""
+    """uniform, free-swing: seed for all random numbers (default: 0)."""
     overwrite: bool = False
     """Replace the file if it exists."""
 

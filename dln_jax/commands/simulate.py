@@ -34,19 +34,19 @@ class Arguments(Folder, Drawn):
     """backward-euler damps, bdf2 (second order) damps little, midpoint (second order) does not damp,
     average-vector-field (second order) keeps the energy."""
     dt: Unstated[float] = None
-    """Time step in s."""
+    """Time step, s (default: the scene's)."""
     seconds: Unstated[float] = None
-    """Duration of the motion in s."""
+    """Duration of the motion, s (default: the scene's)."""
     cells: Unstated[int] = None
     """Cells across the body (drop: rings of the disc); not for the creature."""
     dimension: Unstated[int] = None
     """beam, drop: 2 or 3."""
     youngs_modulus: Unstated[float] = None
-    """E in Pa; not for the creature."""
+    """Young's modulus, Pa; not for the creature."""
     poisson_ratio: Unstated[float] = None
-    """Between -1 and 0.5; not for the creature."""
+    """Poisson's ratio, between -1 and 0.5; not for the creature."""
     material: Unstated[Literal["stable-neo-hookean", "neo-hookean", "st-venant-kirchhoff", "corotated"]] = None
-    """Not for the creature (default: stable-neo-hookean)."""
+    """Strain energy; not for the creature (default: stable-neo-hookean)."""
     order: Unstated[int] = None
     """1: linear elements (default); 2: quadratic elements, which do not lock in bending. Not for the creature."""
     mixed: bool = False

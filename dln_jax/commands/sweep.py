@@ -31,26 +31,26 @@ class Arguments(Resumable):
     grid: Unstated[str] = None
     """Options and their values: 'width=8,16 seed=0:10'."""
     fixed: str = ""
-    """Options that all jobs have: 'steps=500 figures=no test=e,q,v'; a comma is part of the value."""
+    """Options that all jobs share: 'steps=500 figures=no test=e,q,v'; commas belong to the value."""
     where: Unstated[Literal["here", "slurm", "ray", "later"]] = None
-    """What runs the jobs: processes on this machine, an array of the Slurm cluster, or Ray. later only writes the jobs'
-    command lines, for any other scheduler (default: here)."""
+    """Where jobs run: as processes on this machine, as an array of the Slurm cluster, or with Ray. later only writes
+    the command lines, for another scheduler (default: here)."""
     jobs: Unstated[int] = None
-    """Jobs at once (default: as many as there are cores; with Slurm, as many as it allows). Jobs that run side by side
-    slow each other down."""
+    """Number of jobs at once (default: one for each core; with Slurm, as many as it allows). Jobs that run at the same
+    time slow each other down."""
     gpus: Unstated[int] = None
-    """here and ray: accelerators of this machine; each job has one to itself (default: 0, jobs see none)."""
+    """here and ray: number of GPUs of this machine; each job has one to itself (default: 0)."""
     slurm: Unstated[str] = None
     """Options of sbatch: 'partition=gpu time=60 gpus_per_node=1', time in minutes (default: 60). A job that reaches its
     time limit is queued again and continues."""
     metric: Unstated[str] = None
     """Metric of metrics.json that chooses the best job (default: the command's validation error)."""
     best: Unstated[Literal["smallest", "largest"]] = None
-    """Which --metric is the best (default: smallest)."""
+    """Whether the smallest or the largest --metric is best (default: smallest)."""
     error: Unstated[str] = None
-    """Metric that is shown beside it and does not affect the choice (default: the command's test error)."""
+    """Metric shown beside --metric, without influence on the choice (default: the command's test error)."""
     over: Unstated[str] = None
-    """Options, separated by commas, over which medians and the worst are taken (default: seed)."""
+    """Comma-separated options over which medians and worst values are taken (default: seed)."""
 
 
 def main(options: Arguments) -> None:

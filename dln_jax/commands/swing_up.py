@@ -31,18 +31,17 @@ class Arguments(Folder, Drawn):
     model: Literal["identified", "delan", "known", "analytic"] = "identified"
     """Model for the design of the controller."""
     estimator: Literal["extended", "unscented", "differences"] = "extended"
-    """Where the law's states come from: a Kalman filter of the encoders' readings, or their differences."""
+    """Source of the states: an extended or unscented Kalman filter, or differences of the encoder readings."""
     recover: Literal["swing-up", "plans"] = "swing-up"
-    """How the plant comes up again after a push: as from hanging, or by plans from the state after the push, which are
-    improved on the way."""
+    """How to recover from a push: swing up again, or replan on the way."""
     push: float = 0.0
-    """Jump of the passive joints' rates in the middle of every run, 5 s after its start, rad/s (default: no push)."""
+    """Jump of the passive joints' velocities in the middle of every run, rad/s."""
     seconds_of_data: float = 30.0
-    """Seconds of motion to learn from, at least 12, including an episode for validation."""
+    """Duration of the motion to learn from, at least 12 s, including an episode for validation."""
     starts: int = 100
     """Number of starts near hanging at rest."""
     seed: int = 0
-    """Seed of the exploration, the network's initial parameters, the starts and the noise."""
+    """Seed for the exploration, the network's initial parameters, the starts and the noise."""
 
 
 def main(options: Arguments) -> None:

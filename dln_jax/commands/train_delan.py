@@ -42,19 +42,19 @@ class Plant(Drawn, Resumable, Filtered):
     """Data and what they show, and where the results go."""
 
     data: Unstated[Path] = None
-    """Trajectories: npz, CSV, bag (default: letters or --scene)."""
+    """Trajectories as npz, CSV or ROS bag (default: letters)."""
     test: Unstated[str] = None
-    """Test trajectories: labels, comma separated; last:30% of every trajectory; or ten blocks of time in each (default:
+    """Test trajectories: comma-separated labels; last:30% of each; or blocks, for ten blocks of time in each (default:
     e,q,v, else every sixth, else blocks)."""
     scene: Unstated[SceneName] = None
-    """Textbook scene that states the needs, such as chain-3; sampled without data."""
+    """Textbook system, such as chain-3, which states the needs and, without --data, gives the data."""
     needs: Unstated[str] = None
     """Joints and terms, such as 'rp friction' for a revolute and a prismatic joint, or as JSON (default: the scene's or
     file's, else revolute, gravity, friction)."""
     seed: int = 0
-    """Seed of parameters, shuffling and validation."""
+    """Seed for parameters, shuffling and validation."""
     uncertainty: bool = True
-    """Estimate the uncertainty of the torques, and flag states out of distribution."""
+    """Estimate the uncertainty of the torques, which also flags states out of distribution."""
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,11 @@ class Arguments(Drawn, Resumable):
     model: Literal["black-box-hnn", "phase-network"] = "black-box-hnn"
     """An energy in the latent plane, or a network that gives the rates there."""
     trajectories: Unstated[int] = None
-    """Generated films (default: as published)."""
+    """Number of generated films (default: as published)."""
     steps: Unstated[int] = None
-    """Steps of adam (default: those of the published recipe)."""
+    """Steps of Adam (default: as published)."""
     seed: int = 0
-    """Seed of parameters and shuffling."""
+    """Seed for parameters and shuffling."""
 
 
 def main(options: Arguments) -> None:

@@ -64,14 +64,14 @@ class Motion(Drawn, Scaled, Limited, Resumable):
         "trigonometric",
         "planar-chain",
     ] = "auto"
-    """Model to learn; auto: the one that suits the task, for measured the smallest whose validation error no other
-    beats. The last three are for measured."""
+    """Model to learn. auto takes the one that suits the task; for measured, the smallest that no other improves
+    significantly. The last three are for measured."""
     optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
-    """auto: gauss-newton."""
+    """Optimiser; auto is gauss-newton."""
     steps: Unstated[int] = None
-    """Steps of each stage (default: the task's)."""
+    """Iterations of each stage (default: the task's)."""
     seed: int = 0
-    """Seed of parameters, shuffling and validation split."""
+    """Seed for parameters, shuffling and validation."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Networks:
     activation: Unstated[ActivationName] = None
     """Activation of the hidden layers (default: tanh)."""
     field: Unstated[Literal["solenoidal", "conservative", "both"]] = None
-    """helmholtz-hnn: the part that conserves an energy, the gradient, or both (default: both)."""
+    """helmholtz-hnn: the solenoidal part conserves an energy, the conservative one is a gradient (default: both)."""
     learning_rate: Unstated[float] = None
     """adam: peak of the warm-up and cosine schedule (default: 0.005)."""
 

@@ -34,7 +34,7 @@ class Arguments(Resumable, Drawn, Scaled):
     steps: Unstated[int] = None
     """Environment steps of each seed (default: 400000)."""
     until: Unstated[float] = None
-    """The training of a seed ends at this distance, in body lengths (default: no limit)."""
+    """Stop the training of a seed at this distance, in body lengths (default: no limit)."""
     upright: float = 0.05
     """Weight of the posture in the reward, body lengths per step."""
     speed: float = 0.04
@@ -54,7 +54,7 @@ class Arguments(Resumable, Drawn, Scaled):
     width: int = 64
     """Hidden units of the policy."""
     stored: Unstated[Path] = None
-    """Folder of a run whose policy is trained further, perhaps on other ground (default: a new policy)."""
+    """Folder of a run whose policy is trained further, for example on other ground (default: a new policy)."""
 
 
 def main(options: Arguments, *, lanes: int = 4) -> None:

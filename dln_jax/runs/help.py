@@ -6,6 +6,7 @@ import inspect
 import shutil
 import textwrap
 import types
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -112,9 +113,10 @@ def _texts(arguments: type) -> dict[str, str]:
 
 
 def _rows(usage: str, text: str, width: int) -> list[str]:
-    head = textwrap.wrap(usage.replace(",", ", "), width, initial_indent="  ", subsequent_indent="      ")
+    wrap = partial(textwrap.wrap, width=width, break_on_hyphens=False)
+    head = wrap(usage.replace(",", ", "), initial_indent="  ", subsequent_indent="      ")
     head = [line.replace(", ", ",") for line in head]
-    body = textwrap.wrap(text, width, initial_indent=" " * COLUMN, subsequent_indent=" " * COLUMN)
+    body = wrap(text, initial_indent=" " * COLUMN, subsequent_indent=" " * COLUMN)
     if len(head[-1]) < COLUMN - 1 and body:
         return [*head[:-1], f"{head[-1]:{COLUMN}}{body[0][COLUMN:]}", *body[1:]]
     return [*head, *body]
