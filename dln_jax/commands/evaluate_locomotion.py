@@ -52,5 +52,5 @@ def main(options: Arguments) -> None:
         verdict, numbers = judge(trials, options.steps), numbers_of(trials, options.steps)
         title = ", ".join(f"{name} {value:g}" for name, value in task.variation._asdict().items())
         title = f"{task.creature.name}: {title}"
-        metrics = {**numbers, "verdict": float(verdict.number)}
+        metrics = {**numbers, "verdict": verdict.number}
         finish(folder, options, Report(metrics, rows_of(numbers, LABELS, UNITS), title, verdict=verdict))

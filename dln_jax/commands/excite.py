@@ -163,7 +163,7 @@ def main(options: Arguments) -> None:
         random, designed = ([design.condition for design in motions] for motions in (drawn, designs))
         condition, determinant = together(train)
         metrics = {
-            "base_parameters": float(task.columns.size),
+            "base_parameters": task.columns.size,
             "random_condition_median": median(random),
             "random_condition_best": min(random),
             "train_condition_worst": max(designed[:-1]),

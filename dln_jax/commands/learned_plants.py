@@ -102,7 +102,7 @@ def swing_up(options: Any) -> None:
     layout = plant_of_file().layout
     fit = fit_of(options.model, file, layout, options.seed)
     require_positive(starts=options.starts)
-    if not LEAST_SECONDS <= seconds < np.inf:
+    if seconds < LEAST_SECONDS:
         raise InputError(f"--seconds-of-data is {seconds}; expected at least {LEAST_SECONDS:g} s: six episodes")
     require_memory(f"{seconds:.3g} s of motion at {layout.rate:.3g} Hz", 1000.0 * layout.rate * seconds)
     slides = np.array(layout.joints) == "prismatic"
@@ -192,10 +192,10 @@ def tried(make: Callable[..., Plant], fit: Fit, options: Any, folder: Path) -> R
         "success_share": outcomes.share,
         "median_seconds": outcomes.median,
         "worst_seconds": outcomes.worst,
-        "stopped": float(len(trials.stopped)),
+        "stopped": len(trials.stopped),
         "farthest": max((float(np.abs(one.y[:, driven]).max()) for one in complete), default=np.inf),
         "effort_at_goal": float(np.median([np.sqrt(np.mean(one.u[-last:] ** 2)) for one in complete] or np.inf)),
-        "tuning_trials": float(law.trials),
+        "tuning_trials": law.trials,
         "tuning_worked_share": law.worked,
         "tuning_margin": law.margin,
         "learning_seconds": result.seconds,

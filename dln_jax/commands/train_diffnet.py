@@ -26,8 +26,7 @@ UNITS = {
     "value_mse": "y²",
     "gradient_mse": "(y / x)²",
     "hessian_mse": "(y / x²)²",
-    "spread_inside": "y",
-    "spread_outside": "y",
+    "spread": "y",
     "validation_loss": "units of the fit",
 }
 """Units of metrics, from the units x and y of the data."""

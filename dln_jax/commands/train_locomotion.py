@@ -94,7 +94,7 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
     require_positive(seeds=options.seeds, episode=options.episode, **settings._asdict())
     require_positive_if_given(options, ["steps", "until"])
     for name in ("upright", "speed"):
-        if not 0 <= getattr(options, name) < math.inf:
+        if getattr(options, name) < 0:
             raise InputError(f"--{name} is {getattr(options, name)}; expected 0 or a positive number")
     shares(mesh, lanes, LANES)
     clock_period, initial = CLOCK_PERIOD, None
@@ -168,7 +168,7 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
         if any(task.variation):
             trials = perturbed_trials(task, policy, best.parameters)
             verdict = judge(trials)
-            metrics |= {**numbers_of(trials), "verdict": float(verdict.number)}
+            metrics |= {**numbers_of(trials), "verdict": verdict.number}
             lines = (verdict.line,)
         title = f"{options.creature}, gradient"
         shown = f"{title}: {best.distance:.2f} body lengths"

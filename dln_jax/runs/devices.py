@@ -149,12 +149,12 @@ def keep_programs(wanted: bool) -> str:
 
 @functools.cache
 def compilation() -> dict[str, Any]:
-    """Totals since the first call of this function, which are updated in place.
+    """Totals since they were last printed, at first since the first call of this function; they are updated in place.
 
-    `seconds` is the compilation time, including programs that came from the cache; `cached` is the number of these;
-    `unkept` is the reason if programs are not kept, and `line` the last line that was printed.
+    `seconds` is the compilation time, including programs from the cache; `cached` is the number of these; `unkept` is
+    the reason if programs are not kept.
     """
-    counts: dict[str, Any] = {"seconds": 0.0, "cached": 0, "unkept": "", "line": ""}
+    counts: dict[str, Any] = {"seconds": 0.0, "cached": 0, "unkept": ""}
 
     def count(event: str, **_: str | int) -> None:
         counts["cached"] += event == "/jax/compilation_cache/cache_hits"
@@ -168,15 +168,14 @@ def compilation() -> dict[str, Any]:
 
 
 def print_compilation() -> None:
-    """Prints the time of compilation in this process, if it is counted, was long or used the cache, and is news."""
+    """Prints the time of compilation since the last call, if it is counted, and was long or used the cache."""
     if not compilation.cache_info().currsize:
         return
-    seconds, cached, unkept, last = compilation().values()
-    why = f" (none is kept: {unkept})" if unkept else ""
-    line = f"compilation took {seconds:.1f} s; programs from the cache: {cached}{why}"
-    if (seconds >= 0.5 or cached) and line != last:
-        print(line)
-        compilation()["line"] = line
+    seconds, cached, unkept = compilation().values()
+    if seconds >= 0.5 or cached:
+        why = f" (none is kept: {unkept})" if unkept else ""
+        print(f"compilation took {seconds:.1f} s; programs from the cache: {cached}{why}")
+        compilation().update(seconds=0.0, cached=0)
 
 
 def _remove_torn(folder: Path) -> None:

@@ -81,7 +81,6 @@ LABELS = {
 UNITS = {
     "nmse": "1",
     "power_mse": "W²",
-    "normalised_state_error": "1",
     "energy_error_j": "J",
 }
 """Units of metrics other than times and errors of forces."""

@@ -33,7 +33,7 @@ RARE = {
     *("mixed", "youngs_modulus_of", "coupled", "velocity_scale"),
 }
 """Options that `--help` leaves out and `--help-all` shows."""
-METAVARS = {int: "INT", float: "NUMBER", str: "TEXT", Path: "PATH"}
+METAVARS = {int: "INT", float: "NUMBER", Path: "PATH"}
 COLUMN = 20
 """Width of the column of options, characters."""
 

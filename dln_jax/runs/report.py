@@ -62,8 +62,7 @@ def finish(folder: Path, options: Any, report: Report) -> None:
         for name, draw in report.figures.items():
             draw(folder / name)
     print_compilation()
-    for text in (f"run folder: {folder}", *report.lines):
-        print(text)
+    print(f"run folder: {folder}", *report.lines, sep="\n")
     refused = verdict is not None and verdict.level == "refused"
     if refused and report.ended_by_user:
         print(

@@ -52,8 +52,6 @@ UNITS_OF_METRICS = {
     "rollout_mse": "units of q² and p²",
     "_loss": "units of qd² and pd²",
     "clean_field_mse": "units of qd² and pd²",
-    "vpt_lyapunov": "1",
-    "energy_drift": "1",
     "validation_error": "as in training.png",
 }
 UNITS = {"revolute": ("rad", "kg m²/s"), "prismatic": ("m", "kg m/s")}

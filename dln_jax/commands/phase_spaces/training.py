@@ -209,8 +209,8 @@ def train(
     if stop == "time" and not remark:
         remark = f"out of time {at}: kept is the best so far"
     if stop == "not finite":
-        remedy = "state the plant's --needs, try another --model"
-        remedy = "lower --learning-rate" if isinstance(optimiser, Adam) else remedy
+        adam = isinstance(optimiser, Adam)
+        remedy = "lower --learning-rate" if adam else "state the plant's --needs, try another --model"
         remark = (
             f"the loss stopped being finite {at}; the model is the last good one; {remedy}, or check the data for huge "
             "numbers"

@@ -89,8 +89,7 @@ def train(options: Any) -> None:
     }
     network, seeds = network_of(problem, settings), range(options.seed, options.seed + options.seeds)
     with command_folder(options, "train_value") as folder:
-        for line in lines:
-            print(line)
+        print(*lines, sep="\n")
         print(f"{name}: {options.method}, {settings['members']} x {len(widths)} layers of {widths[0]}")
         if options.robust:
             print(f"robust against errors of {options.robust:.0%} of {' and '.join(dict.fromkeys(names))}")
