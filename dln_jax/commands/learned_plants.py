@@ -163,7 +163,7 @@ def tried(make: Callable[..., Plant], fit: Fit, options: Any, folder: Path) -> R
     layout = plant.layout
     driven = (layout.actuation != 0).any(axis=1)
     motors = ", ".join(name for name, motor in zip(layout.names, driven, strict=True) if motor)
-    print(f"joints {', '.join(layout.names)}, motor at {motors}; goal {np.round(layout.goal, 4).tolist()}")
+    print(f"joints {', '.join(layout.names)}; motors at {motors}; goal {np.round(layout.goal, 4).tolist()}")
 
     def keep(explored: Explored) -> None:
         schema.save(recording, explored.recording)
@@ -205,7 +205,7 @@ def tried(make: Callable[..., Plant], fit: Fit, options: Any, folder: Path) -> R
         level = "refused" if outcomes.share < LEAST_SHARE else "doubtful"
         remedy = "record longer (--seconds-of-data), or widen the limits of the plant"
     pushed = "" if push is None else f", pushed after {push.seconds:.3g} s"
-    reason = f"{outcomes.share:.1%} of {options.starts} starts up after {seconds:.3g} s{pushed}"
+    reason = f"{outcomes.share:.1%} of {options.starts} starts are up after {seconds:.3g} s{pushed}"
     return Report(
         metrics=metrics,
         rows=rows_of(metrics, LABELS, {"farthest": "rad or m", "effort": "N m or N"}),
@@ -272,14 +272,14 @@ def learn_to_swing_up(
     hardware = Hardware(encoder_noise=noise, control_noise=np.linalg.pinv(B) @ band, delay=int(prepared.delay))
     unexplained = np.max(np.atleast_1d(hardware.control_noise) / (np.ptp(layout.limits.control, axis=1) / 2))
     say(
-        f"learned: controls {prepared.delay:.3g} sample(s) late, q filtered at {prepared.cutoff:.3g} Hz, "
-        f"{unexplained:.1%} of the motors' limits unexplained"
+        f"learned: delay of the controls {prepared.delay:.3g} sample(s), q filtered at {prepared.cutoff:.3g} Hz, "
+        f"unexplained forces {unexplained:.1%} of the motors' limits"
     )
     wide = process._replace(disturbance=BAND * band)
     make = estimator_of(estimator, layout, wide, delay=prepared.delay)
     law = tune(fitted.dynamics, layout, hardware, estimator=make, late=prepared.delay % 1, seed=seed, recover=recover)
     say(
-        f"tuned by {law.way}: {law.trials} trials, {law.worked:.1%} of the first sets worked; margin "
+        f"tuned by {law.way}: {law.trials} trials, {law.worked:.1%} of the first gains worked; margin "
         f"{law.margin:.0%}, up in {law.seconds:.2f} s"
     )
     return Learned(prepared, fitted, law, time.perf_counter() - began)

@@ -86,8 +86,8 @@ def main(options: Arguments) -> None:
         if where == "later":
             lines = folder / "jobs.sh"
             lines.write_text("".join(f"{shlex.join(job.line(job.folder / 'run'))}\n" for job in left))
-            print(f"{len(left)} jobs, a line each in {lines}, to be run from {Path.cwd()}")
-            print(f"the table is made by: --out {folder} --resume --where here")
+            print(f"{lines} has the command lines of {len(left)} jobs; run them from {Path.cwd()}")
+            print(f"make the table with --out {folder} --resume --where here")
             return
         if left:
             if where == "slurm":

@@ -231,7 +231,7 @@ def main(options: Arguments) -> None:
         metrics |= cost_metrics(training, latency, parameters=parameters, best_step=training.best_step)
         lines = (RELU,) if network.activation == "relu" else ()
         if training.stop.reason == "not finite":
-            lines = ("the loss stopped being finite; the run keeps the best parameters before that", *lines)
+            lines = ("the loss stopped being finite; the best parameters before that are kept", *lines)
         report = Report(
             metrics=metrics | {"verdict": verdict.number},
             rows=rows_of(metrics, units=UNITS),

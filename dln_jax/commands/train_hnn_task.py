@@ -230,16 +230,16 @@ def lines_on(log: "PhaseLog", description: dict[str, Any]) -> Iterator[str]:
     yield from log.remarks
     if in_velocities(log, description):
         q = ", ".join(f"{coordinate:.3g}" for coordinate in gauge_of(log).q)
-        yield f"p = dL/dqd; without torques an energy is one up to a factor: here the mean inertia at q = ({q}) is 1"
+        yield f"p = dL/dqd; without torques the unit of energy is free: the mean inertia at q = ({q}) is set to 1"
     elif not log.momenta:
-        yield "momenta p are taken as qd, per unit of inertia"
+        yield "momenta p are not in the data; qd takes their place (momentum per unit of inertia)"
     if log.assumed:
-        yield "nothing states the needs: joints, potential and friction above are assumed; --needs states them"
+        yield "no needs are stated, so joints, potential and friction above are assumptions; state them with --needs"
     if log.exact is None and "order" in description:
         example = {"bodies": "x1, y1, x2, y2", "axes": "x1, x2, y1, y2"}[description["order"]]
-        yield f"coordinates are taken as {example}, .. with {description['dimension']} axes; --order states it"
+        yield f"assumed order of coordinates: {example}, ... in {description['dimension']} axes; state another --order"
     if log.weights is not None and log.noise is None:
         noise = ", ".join(f"{sd:.2g}" for sd in np.ravel(log.weights.state))
         free = log.free_of_noise
-        yield f"(q, p): {'states are free of noise' if free else f'motions are weighed by noise of {noise}'}"
+        yield f"(q, p): {'states are free of noise' if free else f'motions are weighted by noise of {noise}'}"
     yield from device_lines("f64")

@@ -140,9 +140,7 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
             )
         best = max(trained, key=lambda seed: rank(seed.selected))
         if not math.isfinite(best.distance):
-            raise InputError(
-                f"no evaluation converged; {folder} holds no model: lower the number of steps or the width"
-            )
+            raise InputError(f"no evaluation converged, so {folder} holds no model; lower --steps or --width")
         facts = {"name": NAME, "creature": task.creature.name, "precision": "f64", "clock_period": task.clock_period}
         facts |= {"variation": task.variation._asdict(), "settings": settings._asdict()}
         save_tree(folder, MODEL, best.parameters, {"model": facts})

@@ -268,14 +268,14 @@ def lines_on(fit: Fit, summed: list[int]) -> Iterator[str]:
     """Lines on the seed that is kept, forces known only in sum, and a training that ended early."""
     if not isinstance(fit.seeds, int):
         by = "cross-validation" if fit.cross_validated else "validation"
-        yield f"the run keeps seed {fit.seeds[fit.best]}, the best in {by}"
+        yield f"the run keeps seed {fit.seeds[fit.best]}, the best by {by}"
     if summed:
-        yield f"gravity and friction of joints {summed} are known only in sum; the potential takes any constant"
+        yield f"gravity and friction of joints {summed} are known only as a sum; constants count as potential"
     stop = fit.training.stop
     if stop.reason == "no improvement":
         yield f"stopped early, at step {stop.step}: the validation error no longer improved"
     if stop.reason == "time":
-        yield f"out of time at step {stop.step}: kept is the best so far; --resume continues"
+        yield f"time is up at step {stop.step}; the best parameters so far are kept, and --resume continues"
 
 
 def failure(fit: Fit) -> str:
@@ -284,4 +284,4 @@ def failure(fit: Fit) -> str:
         return ""
     remedy = "lower --learning-rate or use --precision f64" if isinstance(fit.optimiser, Adam) else "check the data"
     step = fit.training.stop.step
-    return f"the loss stopped being finite after step {step}; the model is the last good one; {remedy}"
+    return f"the loss stopped being finite after step {step}; the last good model is kept; {remedy}"

@@ -115,6 +115,6 @@ def test_out_of_time_the_fit_of_rates_is_the_result(positions, capsys):
     """In a folder like any other."""
     options = "--optimizer adam --steps 2 --no-figures --seconds 1e-6 --out hurried"
     command(train_hnn_task, OWN, *SLIDING, options)
-    assert "out of time after the fit of rates: motions were not fitted" in capsys.readouterr().out
+    assert "time was up after the fit to rates; motions were not fitted" in capsys.readouterr().out
     assert np.isfinite(json_of(positions / "hurried/metrics.json")["validation_error"])
     assert isinstance(load("hurried").flow, Flow)

@@ -96,7 +96,7 @@ def test_a_loss_that_explodes_keeps_the_last_good_model(folder, capsys):
 def test_out_of_time_is_a_run_that_has_learned_and_can_go_on_with_more(folder, capsys):
     options = f"--optimizer adam --width 3 --depth 1 {BRIEF} --scene pendulum --steps 400 --seconds 1e-6"
     command(train_delan, options, "--out late")
-    assert "out of time at step" in capsys.readouterr().out
+    assert "time is up at step" in capsys.readouterr().out
     early = json_of(folder / "late/metrics.json")
     assert 0 < early["best_step"] == early["steps"] < 400
     command(train_delan, "--out late --resume --seconds 2e-6", BRIEF)
@@ -115,7 +115,7 @@ WRONG_DATA = [
     ({"q": None}, "key 'q' is missing"),
     ({"tau": np.zeros((20, 2))}, "tau is constant"),
     ({"label": [*"abcdef"]}, "--test f", "'f' has no samples"),
-    ({"tau": None}, "python -m scripts.train_hnn_task --task measured --data"),
+    ({"tau": None}, "dln-jax train_hnn_task --task measured --data"),
     ({"t": None}, "give --rate HZ"),
     (marked("tau", 1e308), "tau has numbers of up to 1.0e+308"),
     ({"tau": 1e10 * marked("tau", 1e18)["tau"]}, "--optimizer adam", "overflow in float32"),

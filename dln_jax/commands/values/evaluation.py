@@ -137,10 +137,10 @@ def verdict_of(numbers: dict[str, float], count: int) -> Verdict:
     down, anywhere = numbers["down_up_share"], numbers["uniform_up_share"]
     altered = [numbers[key] for key in ("heavy_weak_up_share", "light_strong_up_share") if key in numbers]
     error = numbers.get("value_error", 0.0)
-    reason = f"{down:.0%} of {count} hanging starts end up, and {anywhere:.0%} of those anywhere at rest"
+    reason = f"{down:.0%} of {count} hanging starts and {anywhere:.0%} of starts anywhere end upright"
     if altered:
-        reason += f"; {min(altered):.0%} of the hanging ones with the worst masses and motors"
-    reason += f"; V differs from the cost of its law by {error:.1%} in the median"
+        reason += f"; {min(altered):.0%} of hanging starts with the worst masses and motors"
+    reason += f"; V differs from the cost of its law by {error:.1%} (median)"
     remedy = "train longer (--iterations) or with other --seeds, narrow the --box, or give a stronger motor"
     if not down >= FAILED:
         return Verdict("refused", reason, remedy)

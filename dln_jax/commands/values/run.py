@@ -148,7 +148,7 @@ def report_of(
     return Report(
         metrics={**finite(numbers), "verdict": verdict.number},
         rows=rows_of(numbers, LABELS),
-        title=f"returns from {options.starts} starts hanging, and anywhere",
+        title=f"returns from {options.starts} starts near hanging, and as many anywhere",
         verdict=verdict,
         figures={"value.png": png(value_plane, run), "closed-loop.png": png(closed_loop, run)},
         chosen={"plant": run.name},

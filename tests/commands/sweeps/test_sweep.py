@@ -116,7 +116,7 @@ def test_a_resumed_sweep_runs_only_unfinished_jobs(tmp_path, executor, capfd):
 def test_any_scheduler_may_run_the_lines_of_later(tmp_path, executor, capsys):
     out = tmp_path / "sweep"
     command(sweep, "--grid", "width=2,4 seed=0", "--where later --out", out)
-    assert "2 jobs, a line each" in capsys.readouterr().out and not (out / "sweep.json").exists()
+    assert "the command lines of 2 jobs" in capsys.readouterr().out and not (out / "sweep.json").exists()
     lines = (out / "jobs.sh").read_text().splitlines()
     for width, line in zip(("2", "4"), map(shlex.split, lines), strict=True):
         assert line[1:4] == ["-m", "dln_jax", "train_delan"] and f"--width={width}" in line
