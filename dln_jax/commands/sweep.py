@@ -74,8 +74,7 @@ def main(options: Arguments) -> None:
     pairs("--slurm", options.slurm or "")
     command, known = options.command.replace("-", "_"), [name for name in COMMANDS if name != "sweep"]
     if command not in known:
-        like = closest(command, known)
-        raise InputError(f"--command: there is no {command!r:.40}{like} (see dln-jax --help)")
+        raise InputError(f"--command: there is no {command!r:.40}{closest(command, known)} (see dln-jax --help)")
     arguments = importlib.import_module(f"dln_jax.commands.{command}").Arguments
     jobs_of(command, arguments, grid, fixed, Path())  # mistakes are refused before there is a folder
     at_once = options.jobs or (None if where == "slurm" else options.gpus or cores())

@@ -5,7 +5,6 @@ import dataclasses
 import inspect
 import shutil
 import textwrap
-import types
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -89,12 +88,10 @@ def options_of(arguments: type) -> list[tuple[str, str, str]]:
 
 
 def _metavar(kind: Any) -> str:
-    if get_origin(kind) in (types.UnionType, Literal) or type(kind).__name__ == "Union":
-        members = [member for member in get_args(kind) if member is not type(None)]
-        return _metavar(members[0]) if get_origin(kind) is not Literal else "{" + ",".join(map(str, members)) + "}"
-    if get_args(kind):  # annotated, or a tuple of values
-        return _metavar(get_args(kind)[0])
-    return METAVARS.get(kind, "TEXT")
+    members = [member for member in get_args(kind) if member is not type(None)]
+    if get_origin(kind) is Literal:
+        return "{" + ",".join(map(str, members)) + "}"
+    return _metavar(members[0]) if members else METAVARS.get(kind, "TEXT")
 
 
 def _texts(arguments: type) -> dict[str, str]:

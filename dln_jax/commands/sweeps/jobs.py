@@ -233,16 +233,17 @@ def jobs_of(
         return f"--{option}" if TRUTH[text.lower()] else f"--no-{option}"
 
     words: dict[str, dict[str, str]] = {}
+    prog = f"dln-jax {command}"
     for name, texts in {**{name: (text,) for name, text in fixed.items()}, **grid}.items():
         source = "--grid" if name in grid else "--fixed"
         if name in OF_SWEEPS:
             raise InputError(f"{source} has {name}, which every job gets from the sweep; leave it out")
         if name not in types:
-            like = closest(name, list(types))
-            raise InputError(f"{source}: {command} has no option {name}{like} (see {command} --help)")
+            raise InputError(
+                f"{source}: {command} has no option {name}{closest(name, list(types))} (see {prog} --help)"
+            )
         words[name] = {text: word(source, name, text) for text in texts}
     first = {name: next(iter(by_text.values())) for name, by_text in words.items()}
-    prog = f"python -m dln_jax {command}"
     for name, texts in words.items():
         # Parsing takes milliseconds, so that one whole number is checked for all.
         for text in {"0" if text.isdecimal() and len(text) < 10 else text: text for text in texts}.values():
