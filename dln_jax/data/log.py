@@ -177,7 +177,7 @@ def log_of(
         remarks = f" ({'; '.join(data.remarks)})" if data.remarks else ""
         raise InputError(
             f"{name}: there is no tau, which models of torques are fitted to; add the measured torques, or fit motions "
-            f"without applied forces by: dln-jax train_hnn_task --task measured --data {name}{remarks}"
+            f"without applied forces by: python -m scripts.train_hnn_task --task measured --data {name}{remarks}"
         )
     if not driven and np.any(data.tau):
         raise InputError(f"{name} has applied forces tau, unlike free motions; train it by train_hnn --data {name}")
@@ -216,7 +216,7 @@ def log_of(
     remarks = list(preparation(data, smoothed) if driven else data.remarks)
     if cutoff is None and smoothed is not None:
         remarks.insert(0, f"q is filtered before it is differentiated: {noisy[0]} (--cutoff inf leaves q as it is)")
-    remarks += lines_on(findings, name, accept_log, f"dln-jax check_data --data {name}{more}")
+    remarks += lines_on(findings, name, accept_log, f"python -m scripts.check_data --data {name}{more}")
     if robot is not None and any(finding.check == NO_GRAVITY for finding in findings):
         robot = robot._replace(tree=robot.tree._replace(gravity=np.zeros(3)))
     faults = [finding for finding in findings if finding.severity != "note" and finding.check != NO_GRAVITY]

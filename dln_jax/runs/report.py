@@ -105,7 +105,7 @@ LABELS = {
 """Words for parts of metrics' names."""
 
 
-def label_of(name: str, labels: Mapping[str, str] = {}) -> str:
+def spaced(name: str, labels: Mapping[str, str] = {}) -> str:
     """The name of a metric or an option in words: those of `labels` for parts of it, then those of `LABELS`."""
     for part, words in {**labels, **LABELS}.items():
         name = name.replace(part, words)
@@ -118,7 +118,7 @@ def rows_of(
     """Rows of the printed table: label, value and unit of every metric but the verdict, which is printed in words.
 
     Args:
-        labels: as for `label_of`.
+        labels: as for `spaced`.
         units: units by a part of the name; the first that occurs counts, and times have one of their own.
     """
     rows = []
@@ -126,7 +126,7 @@ def rows_of(
         unit = next(unit for part, unit in {**units, "_seconds": "s", "_us": "µs", "": ""}.items() if part in name)
         if name != "verdict":
             whole = float(value).is_integer() and abs(value) < 1e9
-            rows.append((label_of(name, labels), f"{value:,.0f}" if whole else f"{value:.4g}", unit))
+            rows.append((spaced(name, labels), f"{value:,.0f}" if whole else f"{value:.4g}", unit))
     return rows
 
 

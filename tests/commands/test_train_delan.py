@@ -115,7 +115,7 @@ WRONG_DATA = [
     ({"q": None}, "key 'q' is missing"),
     ({"tau": np.zeros((20, 2))}, "tau is constant"),
     ({"label": [*"abcdef"]}, "--test f", "'f' has no samples"),
-    ({"tau": None}, "dln-jax train_hnn_task --task measured --data"),
+    ({"tau": None}, "python -m scripts.train_hnn_task --task measured --data"),
     ({"t": None}, "give --rate HZ"),
     (marked("tau", 1e308), "tau has numbers of up to 1.0e+308"),
     ({"tau": 1e10 * marked("tau", 1e18)["tau"]}, "--optimizer adam", "overflow in float32"),

@@ -1,6 +1,7 @@
 """Identifies a robot: reads its log, fits, judges on held-out motions, and writes the run folder."""
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
@@ -173,21 +174,23 @@ def run(options: Arguments) -> None:
         metrics |= of_verdict
 
         units = ["N m" if kind == "revolute" else "N" for kind in tree.joints]
-        figures = {"torque.png": png(torque_by_joint, test, torques[FITTED], names, units)}
-        if description["needs"]["joint_friction"]:
-            # All joints at once, each over its own range: friction in a joint does not depend on the others.
-            rates = np.linspace(test.qd.min(axis=0), test.qd.max(axis=0), len(test.t))
-            still = np.zeros_like(rates)
-            curves = predict(parameters, test._replace(q=still, qd=rates, qdd=still))[1]
-            torque, friction = predicted[FITTED]
-            figures["friction.png"] = png(
-                friction_curves,
-                {"identified": (rates, curves)},
-                names=names,
-                force_unit=units,
-                measured=(test.qd, test.tau - (torque - friction)),
-                rate_unit=["rad/s" if unit == "N m" else "m/s" for unit in units],
-            )
+        figures: dict[str, Callable[[Path], None]] = {}
+        if options.figures:
+            figures["torque.png"] = png(torque_by_joint, test, torques[FITTED], names, units)
+            if description["needs"]["joint_friction"]:
+                # All joints at once, each over its own range: friction in a joint does not depend on the others.
+                rates = np.linspace(test.qd.min(axis=0), test.qd.max(axis=0), len(test.t))
+                still = np.zeros_like(rates)
+                curves = predict(parameters, test._replace(q=still, qd=rates, qdd=still))[1]
+                torque, friction = predicted[FITTED]
+                figures["friction.png"] = png(
+                    friction_curves,
+                    {"identified": (rates, curves)},
+                    names=names,
+                    force_unit=units,
+                    measured=(test.qd, test.tau - (torque - friction)),
+                    rate_unit=["rad/s" if unit == "N m" else "m/s" for unit in units],
+                )
         if options.uncertainty:
             try:
                 inner = Parts(Split(*inner_split(train), test))

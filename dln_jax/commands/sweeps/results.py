@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from dln_jax.commands.sweeps.jobs import METRICS, Job, status_of
 from dln_jax.figures import style
 from dln_jax.files import as_type, finite, is_file, read_json, write_bytes, write_json
-from dln_jax.runs.report import label_of, print_numbers
+from dln_jax.runs.report import print_numbers, spaced
 from dln_jax.types import InputError
 
 COMPARED = {
@@ -178,7 +178,7 @@ def print_rows(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
         [f"{cell:.3g}" if isinstance(cell, float | int) else shortened(cell or "") for cell in row.values()]
         for row in rows
     ]
-    print_numbers(cells, title=title, columns=[label_of(name) for name in (rows[0] if rows else ())], width=WIDTH)
+    print_numbers(cells, title=title, columns=[spaced(name) for name in (rows[0] if rows else ())], width=WIDTH)
 
 
 def write_tables(folder: Path, results: Mapping[str, Any]) -> None:
@@ -258,10 +258,11 @@ def sweep_figure(results: Mapping[str, Any], at_once: int | None) -> Figure | No
         axis.set_yscale(style.scale_of(y for _, _, y, _ in here))
         style.title(axis, ", ".join(f"{name} {shortened(text)}" for name, text in problem))
     beside = "" if at_once is None else f", {at_once} jobs at once" if at_once > 1 else ", one job at a time"
+    work = seconds.removesuffix("_seconds").replace("train", "training")
     for axis in axes.flat[max(0, len(problems) - columns) : len(problems)]:
-        axis.set_xlabel(f"{label_of(seconds)}, s{beside}")
+        axis.set_xlabel(f"{work}, s{beside}")
     for axis in axes[:, 0]:
-        axis.set_ylabel("test " * (error in COMPARED["error"]) + label_of(error))
+        axis.set_ylabel("test " * (error in COMPARED["error"]) + spaced(error))
 
     def handle(marker: str, label: str, **looks: Any) -> Line2D:
         return Line2D([], [], marker=marker, label=label, **{"linestyle": "", "color": "0.4", **looks})
@@ -269,9 +270,9 @@ def sweep_figure(results: Mapping[str, Any], at_once: int | None) -> Figure | No
     handles = []
     if colour:
         few = kinds[:: -(-len(kinds) // MOST_COLOURS)]
-        handles += [handle("s", f"{label_of(colour)} {kind}", color=colours[kind]) for kind in few]
+        handles += [handle("s", f"{spaced(colour)} {kind}", color=colours[kind]) for kind in few]
     if marker:
-        handles += [handle(markers[form], f"{label_of(marker)} {form}") for form in forms]
+        handles += [handle(markers[form], f"{spaced(marker)} {form}") for form in forms]
     if over:
         handles += [handle("o", "a run", **RUN), handle("o", "median", **MEDIAN)]
     if any(row["best"] for row in rows):
