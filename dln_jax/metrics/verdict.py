@@ -278,7 +278,7 @@ def verdict_metrics(errors: HeldOut, verdict: Verdict) -> dict[str, float | int]
 def _numbers(errors: HeldOut, share: np.ndarray, noise: np.ndarray, names: Sequence[str]) -> str:
     worst = int(np.argmax(share))
     compared = [f"predicting zero {np.mean(errors.zero / errors.unit):.3g}"]
-    compared += [] if errors.file is None else [f"robot's file {np.mean(errors.file / errors.unit):.3g}"]
+    compared += [] if errors.file is None else [f"the robot's file {np.mean(errors.file / errors.unit):.3g}"]
     compared += [f"noise {noise.mean():.2g}"] if noise.any() else []
     single = "" if len(share) == 1 else f", worst {names[worst]} {share[worst]:.3g}"
     return f"held-out nMSE {share.mean():.3g}{single} ({', '.join(compared)})"

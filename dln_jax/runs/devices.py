@@ -94,7 +94,7 @@ def remedy_of(options: Any) -> str:
     """Advice to the user after a process was lost."""
     if not hasattr(options, "resume"):
         return "start all processes again"
-    return f"continue from the last checkpoint in {getattr(options, 'out', '--out')} with --resume in all processes"
+    return f"continue from the last checkpoint in {options.out} with --resume in all processes"
 
 
 def end_at_once(code: int) -> NoReturn:

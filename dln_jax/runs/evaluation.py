@@ -19,15 +19,7 @@ from dln_jax.learning.fit import Fit, double
 from dln_jax.learning.linear import design, design_chunks
 from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.errors import (
-    LEVEL,
-    as_arrays,
-    coverage,
-    errors,
-    mean_square,
-    prediction_program,
-    samples_of,
-)
+from dln_jax.metrics.errors import LEVEL, as_arrays, coverage, errors, mean_square, prediction_program, samples_of
 from dln_jax.metrics.latency import latency_of
 from dln_jax.metrics.motions import Motion, by_trajectory, metrics_of_motions, motion_program, records_of
 from dln_jax.models.model import Model
@@ -47,7 +39,6 @@ CEILINGS = {
 }
 """Rollout metrics and the names of the true plant's values."""
 LABELS = {
-    "torque_mse": "torque MSE",
     "forward_mse": "acceleration MSE",
     "inertial_mse": "inertial force MSE",
     "coriolis_mse": "Coriolis force MSE",
@@ -58,7 +49,6 @@ LABELS = {
     "zero_nmse": "nMSE of predicting zero",
     "noise_nmse": "nMSE of the torque noise (floor)",
     "file_nmse": "nMSE of the robot's file",
-    "validation_error": "validation error, sum over joints",
     "smallest_mass_eigenvalue": "smallest eigenvalue, mass matrix",
     "share_not_definite": "states with an indefinite mass matrix",
     "largest_condition_number": "largest condition number, mass matrix",

@@ -13,9 +13,7 @@ from dln_jax.learning.kinematics.fit import TreeFit
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees.recursions import tree_system
-from dln_jax.metrics.errors import (
-    definiteness,
-)
+from dln_jax.metrics.errors import definiteness
 from dln_jax.metrics.motions import Motion
 from dln_jax.metrics.verdict import FAR_FROM_NOISE, HeldOut, Verdict, held_out, judge, verdict_metrics, worst
 from dln_jax.precision import quick_compilation
