@@ -104,7 +104,7 @@ def main(options: Arguments) -> None:
         centre = numbers_of("--payload-position", options.payload_position, [3])
         tree = with_payload(tree, d - 1, inertial_parameters(options.payload, centre, np.zeros((3, 3))))
     elif options.payload_position != "0,0,0":
-        raise InputError("--payload-position is for a --payload, which is not given; add its mass, or leave it out")
+        raise InputError("--payload-position needs the mass of a --payload; add it, or leave the position out")
     stated = {
         name: numbers_of(f"--{name}", text, [1, d], positive=True)
         for name in ("position", "velocity", "acceleration", "torque")

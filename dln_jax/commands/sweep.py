@@ -65,7 +65,9 @@ def main(options: Arguments) -> None:
     require_positive_if_given(options, ("jobs", "gpus"))
     grid, fixed, where = grid_of(options.grid or ""), pairs("--fixed", options.fixed), options.where or "here"
     if options.jobs is not None and options.jobs > (options.gpus or options.jobs):
-        raise InputError(f"--jobs {options.jobs} for --gpus {options.gpus}; each job has one: give fewer jobs")
+        raise InputError(
+            f"--jobs {options.jobs} for --gpus {options.gpus}; each job needs its own GPU; give fewer jobs"
+        )
     over = ["seed"] if "seed" in grid else []
     if options.over is not None:
         over = names_in("--over", options.over.replace("-", "_"), grid)

@@ -46,7 +46,7 @@ def main(options: Arguments) -> None:
     kind, adam = options.model, optimiser(options.steps)
     train, validation, test = swinging_rod(options.trajectories or TRAJECTORIES)
     with command_folder(options, "train_hnn_pixels") as folder:
-        print(f"pixels: {len(train.q)} films to train on, {len(validation.q)} to select by; {kind}, f32")
+        print(f"pixels: {len(train.q)} films for training, {len(validation.q)} for validation; {kind}, f32")
         known = identity(adam, [train.frames, validation.frames], model=kind, seed=options.seed)
         with progress(adam.steps) as show:
             description, parameters, training = fit(

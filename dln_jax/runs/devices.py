@@ -55,7 +55,7 @@ def membership_in(options: Any) -> Membership | None:
     host_devices(options.devices)
     member = membership(options.processes, options.coordinator, options.process_id)
     if member is not None and getattr(options, "out", None) is None:
-        raise InputError("several processes share their run's folder; name one that all hosts see, by --out")
+        raise InputError("several processes need --out, a run folder that all hosts can see")
     return member
 
 
@@ -66,7 +66,7 @@ def joined(member: Membership, options: Any, *, seconds: int = JOINING) -> Any:
         InputError: JAX has been used. Errors of `join` end the process with one line and status 2.
     """
     if backend_started():
-        raise InputError("JAX has been used in this process; several are started before it is")
+        raise InputError("JAX has been used in this process; start several processes before that")
     own = {"processes", "coordinator", "process_id", "out", "figures"}
     shared = {
         f"--{key.replace('_', '-')}": str(value) if isinstance(value, Path) else value
@@ -116,7 +116,7 @@ def copied_folder(options: Any, resume: bool) -> Iterator[Path]:
             except (OSError, shutil.Error) as error:
                 reason = getattr(error, "strerror", None) or "not all of it could be read"
                 raise InputError(
-                    f"{options.out}: cannot be copied ({reason}); it must be one that all hosts see"
+                    f"{options.out}: cannot be copied ({reason}); all hosts must see this folder"
                 ) from None
         try:
             yield folder

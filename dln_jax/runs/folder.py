@@ -87,11 +87,11 @@ def with_stored_arguments(typed: Any, arguments: type) -> Any:
         moved = stored_files(typed).get(key)
         path, option = moved or Path(str(values.get(key))), f"--{key.replace('_', '-')}"
         if not (is_file(path) or is_folder(path)):
-            raise InputError(f"the run in {folder} reads {path}, which is not here; give its new path by {option}")
+            raise InputError(f"the run in {folder} reads {path}, which does not exist; give its new path with {option}")
         if fingerprint(path) != digest:
             raise InputError(
-                f"the run in {folder} was started with other data than {path} has now (SHA-256); give the file it was "
-                f"started with by {option}"
+                f"the data in {path} have changed since the run in {folder} began (SHA-256); give the original file "
+                f"with {option}"
             )
         changes[key] = path
     for key, value in dataclasses.asdict(typed).items():

@@ -25,10 +25,10 @@ def progress(
     first: list[tuple[int, float]] = []
 
     def rate(done: int, now: float) -> str:
-        """Steps per second since the first call."""
+        """Steps per second since the first call; empty below one."""
         first[:] = first or [(done, now)]
         steps, elapsed = done - first[0][0], now - first[0][1]
-        return f"{steps / elapsed:.0f} {unit}/s" if elapsed > 0 and steps > 0 else ""
+        return f"{steps / elapsed:.0f} {unit}/s" if elapsed > 0 and steps >= elapsed else ""
 
     if console.is_terminal:
         columns = [

@@ -85,7 +85,7 @@ def print_numbers(
     width: int | None = None,
 ) -> None:
     """Prints a table of quantities, their values and units, `width` columns wide (default: the terminal's)."""
-    left = ("quantity", "joint", "unit", "status")
+    left = ("quantity", "joint", "motion", "unit", "status")
     table = Table(*(Column(column, justify="left" if column in left else "right") for column in columns), title=title)
     for row in rows:
         table.add_row(*row)

@@ -111,7 +111,7 @@ def as_one_line(prog: str, options: Any) -> Iterator[None]:
     except InputError as error:
         raise _refusal(str(error)) from None
     except MemoryError as error:
-        raise _refusal(f"out of memory ({error or 'no more can be had'}); ask for less") from None
+        raise _refusal(f"out of memory ({error or 'no more is available'}); ask for less") from None
     except (RuntimeError, AssertionError) as error:
         if "RESOURCE_EXHAUSTED" in str(error):
             raise _refusal(f"out of memory ({str(error).splitlines()[0]:.200}); ask for less") from None

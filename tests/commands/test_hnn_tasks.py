@@ -86,7 +86,7 @@ def test_what_a_task_does_not_take_is_one_line(positions, capsys):
         ("--task spring --data positions.npz", "--data is an option of --task measured"),
         ("--task spring --test a", "--test is an option of --task measured"),
         ("--task spring", *SLIDING, "--needs is an option of --task measured"),
-        ("--task spring --model trigonometric", "is of no phase space"),
+        ("--task spring --model trigonometric", "has no phase space"),
         (OWN, "--needs", '{"joints": ["revolute", "revolute"]}', "has 2 joints"),
         (OWN, "--noise small", "--noise is 'small'"),
         (OWN, "--noise 0", "finite positive numbers"),

@@ -139,7 +139,7 @@ def status_of(folder: Path) -> Status:
     if status.attempt < 0 or not _RUN.fullmatch(status.run) or (folder / status.run).is_symlink():
         raise InputError(f"{path}: attempt {status.attempt}, run '{status.run:.60}' are not those of a job; {remedy}")
     if status.state == "done" and not any((folder / status.run).glob("*")):
-        return Status(line="its run is gone", attempt=status.attempt)
+        return Status(line="its run folder is missing", attempt=status.attempt)
     return status
 
 
@@ -219,9 +219,9 @@ def jobs_of(
     hints = get_type_hints(whole)
     types = {field.name: hints[field.name] for field in dataclasses.fields(whole)} | {"compilation_cache": bool}
     if both := [name for name in grid if name in fixed]:
-        raise InputError(f"{both[0]} is in --grid and in --fixed; leave it out of one")
+        raise InputError(f"{both[0]} is in both --grid and --fixed; leave it out of one")
     if "out" not in types:
-        raise InputError(f"{command} has no --out, so that it leaves nothing to compare; choose a command that trains")
+        raise InputError(f"{command} has no --out and leaves nothing to compare; choose a command that trains")
 
     def word(source: str, name: str, text: str) -> str:
         """The command-line word for an option's value."""

@@ -49,9 +49,7 @@ def train(options: Any) -> None:
     require_positive(starts=options.starts, seeds=options.seeds)
     require_positive_if_given(options, ("width", "depth", "members", "iterations"))
     if not 0 <= options.robust < 1:
-        raise InputError(
-            f"robust is {options.robust}; expected a share of masses and motors of at least 0 and less than 1"
-        )
+        raise InputError(f"--robust is {options.robust}; expected a fraction of masses and motors, from 0 to below 1")
     goal = None if options.goal is None else numbers_of("--goal", options.goal)
     actuated, control = names_listed(options.actuated), positive_numbers(options, "control")
     control = control[0] if control is not None and len(control) == 1 else control
