@@ -185,7 +185,7 @@ def main(options: Any) -> None:
     networks = optimizer == "adam" or not keywords.keys() <= {"order"}
     name, rate = "gauss-newton" if optimizer == "auto" else optimizer, getattr(options, "learning_rate", None)
     optimiser = optimiser_named(name, precision="f64", learning_rate=rate)
-    if isinstance(options, Recorded):
+    if options.task in RECORDED:
         noise = None if options.noise is None else numbers_of("--noise", options.noise, positive=True)
         known = {"needs": needs_of(options.needs), "test": options.test, "noise": noise}
         log = read_motions(options.task, options.data, **known, **facts(options))
