@@ -79,7 +79,7 @@ def test_own_positions_train_and_resume_to_the_same_model(positions, capsys):
 def test_what_a_task_does_not_take_is_one_line(positions, capsys):
     rows = [
         ("--task juggling", "task 'juggling' is unknown"),
-        ("--task measured", "needs its data"),
+        ("--task measured", "give it with --data"),
         ("--task measured --data forced.npz", "applied forces"),
         ("--task measured --data marked.npz", "q has numbers of up to 1.0e+308"),
         ("--task measured --data points.npz", "no trajectory has two samples"),
