@@ -53,7 +53,7 @@ def main() -> None:
             width = max(map(len, COMMANDS))
             for name in COMMANDS:
                 print(f"  {name:{width}}  {first_line(name)}")
-            print("\npython -m scripts.report NAME, in a checkout, measures the project", flush=True)
+            print("\nIn the repository, python -m scripts.report NAME repeats a benchmark.", flush=True)
             return
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -64,7 +64,7 @@ class Limited:
     """Time limit until the model is stored."""
 
     seconds: Unstated[float] = None
-    """Time limit of the training, s (default: none)."""
+    """Time limit for training, s (default: none)."""
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,9 @@ class Logged:
     rate: Unstated[float] = None
     """Sampling rate of a file without t, Hz."""
     units: Unstated[Literal["si", "degrees"]] = None
-    """CSV: units of columns whose titles state none."""
+    """Units of CSV columns without a unit in the title."""
     joints: Unstated[str] = None
-    """Joints to keep, in this order; LOG=NAME renames one (default: all, also with a prefix or ending)."""
+    """Joints to keep, in this order; LOG=NAME renames one (default: all; names may have a prefix or ending)."""
     topics: Unstated[str] = None
     """ROS bag: topics of joint states, comma separated (default: the only one)."""
     torque_factor: Unstated[str] = None
@@ -108,7 +108,7 @@ class Checked(Logged):
     """How to treat a log with errors."""
 
     accept_log: bool = False
-    """Continue although the check of the log found errors."""
+    """Continue in spite of errors in the log."""
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,8 @@ class Filtered(Checked):
     """How to derive rates where a log has no reliable ones."""
 
     cutoff: Unstated[str] = None
-    """Cut-off of the low-pass on q, Hz, from which rates follow; auto, or inf for none (default: the file's rates; auto
-    where it has none and q is noisy)."""
+    """Cut-off frequency of the low-pass filter on q, from which rates are derived, Hz; auto, or inf for no filter
+    (default: the rates in the file; auto if it has none and q is noisy)."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class CompilationCache:
     """The option of all commands."""
 
     compilation_cache: bool = True
-    """Keep compiled programs in the user's cache (at most 512 MiB)."""
+    """Keep compiled programs in your cache folder (at most 512 MiB)."""
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,10 @@
-"""Validate a log before training: what is wrong with it, and what to do about it.
+"""Check a log before you train on it or identify a robot.
 
 Checks sampling times, units, signs, qd and qdd against q, the delay between q and tau, saturation, encoder steps,
-noise, joints that hardly move, and friction; with --robot also gravity, gears, the order and limits of joints, and how
-well the motions determine the robot's parameters. Prints a report and writes it as report.txt, the findings as
-findings.json, and a figure: spectra and cut-off, delay, and torque against velocity. The exit status is 1 if there are
-errors, and 0 if there are only warnings and notes.
+noise, joints that hardly move, and friction. With --robot it also checks gravity, gear ratios, the order and limits of
+joints, and how well the motions determine the robot's parameters. Every finding comes with a remedy. The run folder
+gets report.txt, findings.json and a figure with spectra and cut-off, delay, and torque against velocity. The exit
+status is 1 if there are errors, and 0 if there are only warnings and notes.
 """
 
 import contextlib
@@ -24,10 +24,10 @@ class Arguments(Folder, Drawn, Logged):
     data: Path
     """Log as npz, CSV or ROS bag: t and q, and optionally tau, qd, qdd and trajectory."""
     robot: Unstated[Path] = None
-    """URDF or MJCF of the robot (needs MuJoCo)."""
+    """URDF or MJCF file of the robot (needs MuJoCo)."""
     lock: Unstated[str] = None
-    """Joints of the robot to lock, such as those of a gripper, separated by commas; "*finger*" stands for all names
-    that contain finger (default: all move)."""
+    """Comma-separated joints that do not move, such as those of a gripper; "*finger*" matches all names that contain
+    finger (default: all move)."""
 
 
 def main(options: Arguments) -> None:

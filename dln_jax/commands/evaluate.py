@@ -1,7 +1,7 @@
-"""Evaluate a stored model of dynamics on another log: its errors, its rollouts, its speed and a verdict.
+"""Evaluate a stored model of dynamics on another log.
 
-The model is that of a run of train_delan, train_hnn or identify. All trajectories of the log are the test; nothing is
-fitted. A run folder gets the metrics, the figures and the verdict.
+The model comes from a run of train_delan, train_hnn or identify. All trajectories of the log are the test set; nothing
+is fitted. The table reports errors, rollouts and speed. The run folder gets metrics, figures and verdict.
 """
 
 from dataclasses import dataclass

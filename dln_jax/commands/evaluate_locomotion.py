@@ -1,8 +1,9 @@
-"""Evaluate a stored policy of a soft creature on any ground: how often it falls, and how far it goes.
+"""Evaluate a stored policy of a soft creature.
 
-Runs episodes from perturbed starts, on the steepest slopes, up and down, that --slope allows; ground that is not stated
-is that of the training. Prints the episodes without a fall, the distances before a fall, and a verdict: good from 95 %
-without a fall, if none of them goes backwards, and refused below 50 %, with exit status 1. Writes metrics.json.
+Runs episodes from perturbed starts on the steepest slopes, up and down, that --slope allows. The ground is that of the
+training unless options state it. Prints the number of episodes without a fall, the distances before a fall, and a
+verdict: good if at least 95 % have no fall and none goes backwards, refused below 50 % (exit status 1). Writes
+metrics.json.
 """
 
 from dataclasses import dataclass
@@ -36,15 +37,14 @@ class Arguments(Folder):
 
 def main(options: Arguments) -> None:
     """Evaluates the policy, prints and writes the numbers."""
-    from dln_jax.commands.locomotion import judge, load_policy
+    from dln_jax.commands.locomotion import LABELS, UNITS, judge, load_policy
     from dln_jax.locomotion.learning import numbers_of, perturbed_trials
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.report import Report, finish, rows_of
-    from dln_jax.types import require_positive, require_seed
+    from dln_jax.types import require_positive
 
     sizes = {"starts": options.starts, "steps": options.steps}
     require_positive(**sizes)
-    require_seed(options.seed)
     ground = {name: getattr(options, name) for name in ("start", "slope", "rough", "push")}
     task, policy, parameters, _ = load_policy(options.run, **ground)
     with command_folder(options, "evaluate_locomotion") as folder:
@@ -52,5 +52,5 @@ def main(options: Arguments) -> None:
         verdict, numbers = judge(trials, options.steps), numbers_of(trials, options.steps)
         title = ", ".join(f"{name} {value:g}" for name, value in task.variation._asdict().items())
         title = f"{task.creature.name}: {title}"
-        metrics = {**numbers, "verdict": float(verdict.number)}
-        finish(folder, options, Report(metrics, rows_of(numbers), title, verdict=verdict))
+        metrics = {**numbers, "verdict": verdict.number}
+        finish(folder, options, Report(metrics, rows_of(numbers, LABELS, UNITS), title, verdict=verdict))

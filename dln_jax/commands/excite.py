@@ -1,10 +1,11 @@
-"""Design motions that show a robot's parameters: Fourier series within its limits, the best by gradients.
+"""Design motions that identify a robot, within its limits.
 
-Each motion starts and ends at rest and may be repeated. Several are for identification, each optimised to complement
-those before it, and one is for validation. Predicted torques come from the file's inertias and friction, and from a
-payload. Writes a run folder: excitation.npz (the schema of trajectories), a CSV file for each motion (t, q, qd),
-motions.json (the series), excitation.png, metrics.json and config.json. Limits are those of the file unless options
-state them. A list of numbers has one for each joint.
+Each motion is a Fourier series that starts and ends at rest and can be repeated. Gradients improve the best of several
+random series. Several motions are for identification, each optimised to complement those before it, and one is for
+validation. Torques are predicted from the file's inertias and friction and from a payload. The run folder gets
+excitation.npz (the schema of trajectories), a CSV file for each motion (t, q, qd), motions.json (the series),
+excitation.png, metrics.json and config.json. Limits come from the file unless options state them. Options that take
+lists expect one number for each joint.
 """
 
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ class Arguments(Folder, Drawn):
     robot: Path
     """URDF or MJCF file; its meshes may be missing."""
     seconds: float = 20.0
-    """Length of each motion, which is its period, s."""
+    """Length of each motion and period of its series, s."""
     harmonics: int = 5
     """Harmonics of the series; the highest frequency is harmonics / seconds, Hz."""
     rate: float = 100.0
@@ -38,7 +39,7 @@ class Arguments(Folder, Drawn):
     velocity_scale: float = 0.05
     """Velocity at which dry friction has 76 % of its force, rad/s or m/s."""
     share: float = 0.9
-    """Share of every limit to use; the rest is left to the controller."""
+    """Fraction of every limit to use; the rest is left to the controller."""
     position: Unstated[str] = None
     """Half the range of positions about zero, rad or m (default: the file's)."""
     velocity: Unstated[str] = None
@@ -51,7 +52,7 @@ class Arguments(Folder, Drawn):
     """Comma-separated joints that may lack limits of position and torque; "*wheel*" matches all names that contain
     wheel. Positions are then limited to pi on either side (default: such joints are refused)."""
     noise: str = "1"
-    """Standard deviation of the torque's noise; only the ratios of joints matter."""
+    """Standard deviation of the torque noise; only the ratios of the joints matter."""
     height: Unstated[float] = None
     """Height of a plane, m; the origins of all moving links stay above it (default: no plane)."""
     payload: Unstated[float] = None
@@ -103,7 +104,7 @@ def main(options: Arguments) -> None:
         centre = numbers_of("--payload-position", options.payload_position, [3])
         tree = with_payload(tree, d - 1, inertial_parameters(options.payload, centre, np.zeros((3, 3))))
     elif options.payload_position != "0,0,0":
-        raise InputError("--payload-position is for a --payload, which is not given; add its mass, or leave it out")
+        raise InputError("--payload-position needs the mass of a --payload; add it, or leave the position out")
     stated = {
         name: numbers_of(f"--{name}", text, [1, d], positive=True)
         for name in ("position", "velocity", "acceleration", "torque")
@@ -157,16 +158,17 @@ def main(options: Arguments) -> None:
 
         # A random set combines as many motions as the training set.
         groups = [drawn[place : place + count] for place in range(0, len(drawn) - count + 1, count)]
+        of_groups = np.median([together(group) for group in groups], axis=0)
         ratios = [error_ratio(train, group) for group in groups]
         random, designed = ([design.condition for design in motions] for motions in (drawn, designs))
         condition, determinant = together(train)
         metrics = {
-            "base_parameters": float(task.columns.size),
+            "base_parameters": task.columns.size,
             "random_condition_median": median(random),
             "random_condition_best": min(random),
             "train_condition_worst": max(designed[:-1]),
             "validation_condition": validation.condition,
-            "random_set_condition_median": median(together(group)[0] for group in groups),
+            "random_set_condition_median": float(of_groups[0]),
             "train_set_condition": condition,
             "random_log_determinant_median": median(design.log_determinant for design in drawn),
             "train_set_log_determinant": determinant,
@@ -181,7 +183,7 @@ def main(options: Arguments) -> None:
                 (label, design.condition, design.log_determinant, design.nearest)
                 for label, design in zip(labels, designs, strict=True)
             ),
-            (f"random, {count} together", metrics["random_set_condition_median"], np.nan, ""),
+            (f"random, {count} together, median", *of_groups, ""),
             (f"train, {count} together", condition, determinant, ""),
         ]
         table = [(name, f"{number:.3g}", f"{logarithm:.1f}", near) for name, number, logarithm, near in rows]
@@ -189,6 +191,6 @@ def main(options: Arguments) -> None:
 
         figure = png(excitation_figure, data, shown, names=names, conditions={"random": random, "designed": designed})
         size, ratio = task.columns.size, metrics["standard_error_ratio_median"]
-        line = f"standard errors of {size} base parameters: {ratio:.2f} of those after random motions, on average"
+        line = f"standard errors of {size} base parameters over those after random motions: {ratio:.2f} (median)"
         columns = ("motion", "condition", "log det", "nearest limit")
         finish(folder, options, Report(metrics, table, "", columns, lines=(line,), figures={"excitation.png": figure}))

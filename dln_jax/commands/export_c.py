@@ -1,17 +1,20 @@
-"""Export the model of a run as C99 source without dependencies: header, source, a demo and a CMake file.
+"""Export the model of a run as C99 source.
 
-The run is one of a training command. The functions take one state, in SI units. A model of dynamics has inverse and
-forward dynamics, gravity, Coriolis force, friction, mass matrix, energy, integration steps x_next = F(x, u, dt), and
-the exact derivatives of all of them. A model of a phase space has rates and steps; a differential network has its
-value, Jacobian and Hessian. Without --functions, all functions are exported except those that take long to compile.
-The C code does not allocate memory and keeps no state. dln_jax.load_c compiles it and calls it from Python;
-dln_jax.export_c exports any other JAX function.
+The run comes from a training command. The export has a header, a source, a demo program and a CMake file, and depends
+on nothing but <math.h>. The functions take one state, in SI units. A model of dynamics has inverse and forward
+dynamics, gravity, Coriolis force, friction, mass matrix, energy, integration steps x_next = F(x, u, dt), and the exact
+derivatives of all of them. A model of a phase space has rates and steps; a differential network has its value,
+Jacobian and Hessian. Without --functions, all functions are exported except those that take long to compile. The C code
+allocates no memory and keeps no state. dln_jax.load_c compiles it and calls it from Python; dln_jax.export_c exports
+any other JAX function.
 """
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from dln_jax.errors import InputError
 from dln_jax.options import Unstated
 
 
@@ -21,8 +24,9 @@ class Arguments:
 
     run: Path
     """Folder of a training run, with model.json and model.safetensors."""
-    out: Path
-    """Folder for NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt; created if missing."""
+    out: Unstated[Path] = None
+    """Folder of NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt (default: RUN-c-1, -2, ... beside the folder
+    RUN)."""
     functions: Unstated[tuple[str, ...]] = None
     """Names, such as inverse_dynamics step_rk4_jacobian (default: all; a wrong name lists them)."""
     precision: Unstated[Literal["f32", "f64"]] = None
@@ -47,8 +51,14 @@ def main(options: Arguments) -> None:
     from dln_jax.export.functions import functions_of_run
     from dln_jax.zoo.run import load
 
+    run, out = load(options.run), options.out
+    if out is None:
+        names = (f"{options.run.resolve().name}-c-{number}" for number in itertools.count(1))
+        out = next(folder for name in names if not (folder := options.run.parent / name).exists())
+    elif (out / "CMakeLists.txt").exists() and not options.overwrite:
+        raise InputError(f"the folder {out} already contains an export; choose another --out, or add --overwrite")
     functions = functions_of_run(
-        load(options.run),
+        run,
         precision=options.precision,
         names=options.functions,
         iterations=options.iterations,
@@ -59,14 +69,14 @@ def main(options: Arguments) -> None:
         casadi = [name for name in functions if not name.endswith(("_jacobian", "_gradient", "_hessian"))]
     paths = export_c(
         functions,
-        options.out,
+        out,
         name=options.name,
         casadi=casadi,
         finite=options.finite,
         leave_out_large=options.functions is None,
         overwrite=options.overwrite,
     )
-    print(f"{options.out}: {', '.join(path.name for path in paths)}")
+    print(f"{out}: {', '.join(path.name for path in paths)}")
     for path in paths:
         for line in path.read_text().splitlines():
             if line.startswith(" * Left out: "):

@@ -1,9 +1,9 @@
-"""Identify a robot from its URDF or MJCF file and a log of q, qd, qdd and tau.
+"""Identify a robot from its URDF or MJCF file and a log.
 
-Finds base parameters with standard errors, friction, and physically consistent parameters, and states what the data do
-not determine. A run folder gets config.json, metrics.json, the model (load it with dln_jax.load, or export it to C),
-report.txt and parameters.json, the robot's file with the identified values, and figures. Held-out trajectories judge
-the result, or blocks of time if there is only one trajectory.
+Fits base parameters with standard errors, friction, and physically consistent inertias to q, qd, qdd and tau, and
+reports what the data do not determine. The run folder gets the model (load it with dln_jax.load, or export it to C),
+the robot's file with the identified values, report.txt, parameters.json, metrics.json, config.json and figures.
+Held-out trajectories judge the result, or held-out blocks of time if there is only one trajectory.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class Robot:
     """The robot, the data, and the way of identification."""
 
     robot: Path
-    """URDF or MJCF file: the kinematics, and values to start from. It is not changed."""
+    """URDF or MJCF file with the kinematics and starting values. It is not changed."""
     data: Path
     """Trajectories as npz, CSV or ROS bag, with tau; joint names, if present, are matched with the robot's."""
     test: Unstated[str] = None
@@ -31,25 +31,25 @@ class Robot:
     lock: Unstated[str] = None
     """Joints that do not move; "*finger*" matches all names that contain finger (default: all move)."""
     friction: Annotated[str, choice((*LAWS, TEMPERATURE, NO_FRICTION), several=True)] = "viscous,coulomb,offset"
-    """Friction laws to identify (default: viscous,coulomb,offset). Load, a share of the torque that a gear carries, and
-    temperature, with which viscous friction falls, are left out unless cross-validation favours them."""
+    """Friction laws to identify (default: viscous,coulomb,offset). Load (friction that grows with the torque in the
+    gear) and temperature (viscous friction that falls with it) are kept only if cross-validation favours them."""
     motors: Unstated[str] = None
     """Rows of the matrix S of motor rates S qd, if motors turn with several joints (parallelograms, belts), such as
     "1,0,0; 0,1,0; 0,1,1"; armature and friction then act at the motors (default: one motor per joint)."""
     coupled: Unstated[str] = None
-    """Pairs of joints, such as 2:3, whose motors share an inertia off the armature's diagonal, for gears of unknown
-    ratio; a pair is left out if no motion can show it, or cross-validation does not favour it."""
+    """Pairs of joints, such as 2:3, whose motors share an inertia (an off-diagonal entry of the armature), for gears of
+    unknown ratio; a pair is dropped if no motion shows it or cross-validation does not favour it."""
     velocity_scale: Unstated[float] = None
     """Velocity at which dry friction has three quarters of its force, rad/s or m/s (default: fitted for each joint)."""
     by: Literal["torques", "motions", "both"] = "torques"
     """Fit to torques of filtered motions, to motions simulated with the torques (output error), or to both."""
     window: Unstated[float] = None
-    """Length of the simulated windows of --by motions and both, s (default: chosen by inner splits of the training
-    data, which may also keep the parameters fitted to torques)."""
+    """Length of the simulated windows of --by motions and both, s (default: chosen by cross-validation within the
+    training data, which may also keep the parameters fitted to torques)."""
     uncertainty: bool = True
-    """Estimate the uncertainty of the torques, and flag states out of distribution."""
+    """Estimate the uncertainty of the torques, which also flags states out of distribution."""
     robust: bool = False
-    """Huber's estimate, for torques with spikes."""
+    """Use Huber's robust estimate, for torques with spikes."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ from dln_jax.control.plants.mujoco_plants import mujoco_plant, plant_file
 from dln_jax.control.plants.planned import TrackedPlan
 from dln_jax.control.plants.plant import Layout, Plant
 from dln_jax.control.plants.runs import HELD, PlantRun, Trials, compiled, judged_runs, run, start_of
-from dln_jax.control.plants.tuning import SwingUp, require_recovery, tune
+from dln_jax.control.plants.tuning import SwingUp, tune
 from dln_jax.data import schema
 from dln_jax.data.encoders.sampling import held_at_equal_steps, noise_of
 from dln_jax.data.robots import read_robot
@@ -45,7 +45,7 @@ from dln_jax.runs.arguments import names_listed
 from dln_jax.runs.folder import command_folder
 from dln_jax.runs.progress import progress
 from dln_jax.runs.report import Report, finish, png, rows_of
-from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.types import InputError, require_positive
 from dln_jax.zoo.descriptions import build, describe
 from dln_jax.zoo.run import save
 
@@ -61,6 +61,16 @@ TURN, SLIDE = 2 * np.pi / 4096, 1e-4
 """Resolutions of the simulated encoders of revolute and prismatic joints, rad and m."""
 CUTOFFS = (1.0, 2.0)
 """Multiples of the usual cut-off that are compared: fast motions of a short log may be too rare to raise it."""
+LABELS = {
+    "success_share": "share of starts that come up",
+    "median_seconds": "median time to come up",
+    "worst_seconds": "longest time to come up",
+    "stopped": "starts stopped at a limit",
+    "farthest": "largest travel of the driven joints",
+    "effort_at_goal": "rms control at the goal",
+    "tuning_worked_share": "share of first gains that worked",
+}
+"""Words for parts of metrics' names."""
 BAND = 10.0
 """Factor that widens the filter's torque band, for model errors that a short log does not show."""
 
@@ -91,11 +101,8 @@ def swing_up(options: Any) -> None:
     plant_of_file = functools.partial(mujoco_plant, file, names_listed(options.actuated), control=options.control)
     layout = plant_of_file().layout
     fit = fit_of(options.model, file, layout, options.seed)
-    require_estimator(options.estimator)
-    require_recovery(options.recover)
     require_positive(starts=options.starts)
-    require_seed(options.seed)
-    if not LEAST_SECONDS <= seconds < np.inf:
+    if seconds < LEAST_SECONDS:
         raise InputError(f"--seconds-of-data is {seconds}; expected at least {LEAST_SECONDS:g} s: six episodes")
     require_memory(f"{seconds:.3g} s of motion at {layout.rate:.3g} Hz", 1000.0 * layout.rate * seconds)
     slides = np.array(layout.joints) == "prismatic"
@@ -156,7 +163,7 @@ def tried(make: Callable[..., Plant], fit: Fit, options: Any, folder: Path) -> R
     layout = plant.layout
     driven = (layout.actuation != 0).any(axis=1)
     motors = ", ".join(name for name, motor in zip(layout.names, driven, strict=True) if motor)
-    print(f"joints {', '.join(layout.names)}, motor at {motors}; goal {np.round(layout.goal, 4).tolist()}")
+    print(f"joints {', '.join(layout.names)}; motors at {motors}; goal {np.round(layout.goal, 4).tolist()}")
 
     def keep(explored: Explored) -> None:
         schema.save(recording, explored.recording)
@@ -185,10 +192,10 @@ def tried(make: Callable[..., Plant], fit: Fit, options: Any, folder: Path) -> R
         "success_share": outcomes.share,
         "median_seconds": outcomes.median,
         "worst_seconds": outcomes.worst,
-        "stopped": float(len(trials.stopped)),
+        "stopped": len(trials.stopped),
         "farthest": max((float(np.abs(one.y[:, driven]).max()) for one in complete), default=np.inf),
         "effort_at_goal": float(np.median([np.sqrt(np.mean(one.u[-last:] ** 2)) for one in complete] or np.inf)),
-        "tuning_trials": float(law.trials),
+        "tuning_trials": law.trials,
         "tuning_worked_share": law.worked,
         "tuning_margin": law.margin,
         "learning_seconds": result.seconds,
@@ -198,10 +205,10 @@ def tried(make: Callable[..., Plant], fit: Fit, options: Any, folder: Path) -> R
         level = "refused" if outcomes.share < LEAST_SHARE else "doubtful"
         remedy = "record longer (--seconds-of-data), or widen the limits of the plant"
     pushed = "" if push is None else f", pushed after {push.seconds:.3g} s"
-    reason = f"{outcomes.share:.1%} of {options.starts} starts up after {seconds:.3g} s{pushed}"
+    reason = f"{outcomes.share:.1%} of {options.starts} starts are up after {seconds:.3g} s{pushed}"
     return Report(
         metrics=metrics,
-        rows=rows_of(metrics),
+        rows=rows_of(metrics, LABELS, {"farthest": "rad or m", "effort": "N m or N"}),
         title=f"swing-ups from {options.starts} starts",
         verdict=Verdict(level, reason, remedy),
         figures={"swing-ups.png": png(measured_traces, complete[:MOST_SHOWN], layout)} if complete else {},
@@ -265,14 +272,14 @@ def learn_to_swing_up(
     hardware = Hardware(encoder_noise=noise, control_noise=np.linalg.pinv(B) @ band, delay=int(prepared.delay))
     unexplained = np.max(np.atleast_1d(hardware.control_noise) / (np.ptp(layout.limits.control, axis=1) / 2))
     say(
-        f"learned: controls {prepared.delay:.3g} sample(s) late, q filtered at {prepared.cutoff:.3g} Hz, "
-        f"{unexplained:.1%} of the motors' limits unexplained"
+        f"learned: delay of the controls {prepared.delay:.3g} sample(s), q filtered at {prepared.cutoff:.3g} Hz, "
+        f"unexplained forces {unexplained:.1%} of the motors' limits"
     )
     wide = process._replace(disturbance=BAND * band)
     make = estimator_of(estimator, layout, wide, delay=prepared.delay)
     law = tune(fitted.dynamics, layout, hardware, estimator=make, late=prepared.delay % 1, seed=seed, recover=recover)
     say(
-        f"tuned by {law.way}: {law.trials} trials, {law.worked:.1%} of the first sets worked; margin "
+        f"tuned by {law.way}: {law.trials} trials, {law.worked:.1%} of the first gains worked; margin "
         f"{law.margin:.0%}, up in {law.seconds:.2f} s"
     )
     return Learned(prepared, fitted, law, time.perf_counter() - began)

@@ -29,6 +29,17 @@ GOOD, REFUSED = 0.95, 0.5
 """A policy is good from the first share of episodes without a fall on, and refused below the second."""
 FILMED, STRIDE = 160, 2
 """Steps of the film, and steps per frame."""
+LABELS = {
+    "perturbed_starts": "episodes from perturbed starts",
+    "perturbed_steps": "steps of an episode",
+    "perturbed_without_fall": "episodes without a fall",
+    "perturbed_distance_body_lengths": "distance before a fall",
+    "distance_body_lengths": "distance",
+    "_least": ", least",
+    "_rad": "",
+}
+"""Words for parts of metrics' names."""
+UNITS = {"distance_body_lengths": "body lengths", "tilt": "rad"}
 SHOWN = 3_000_000
 """Seed of the rough ground that is shown."""
 

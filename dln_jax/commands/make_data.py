@@ -1,7 +1,8 @@
-"""Generate trajectories of a textbook scene, with exact rates, torques and force decomposition, as an npz file.
+"""Generate trajectories of a textbook system as npz.
 
-Kinds: `characters` (the two-link arm writes 20 letters), `uniform` (independent random states in a box), and
-`free-swing` (motions from rest without torque, integrated to 1e-10).
+The file has exact rates, torques and a decomposition of the forces. Kinds: `characters` (the two-link arm writes 20
+letters), `uniform` (independent random states in a box), and `free-swing` (motions from rest without torque, integrated
+to 1e-10).
 """
 
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ class Arguments:
     out: Path
     """File to write; its name ends in .npz."""
     scene: SceneName = "two-link-arm"
-    """The textbook system."""
+    """Textbook system."""
     kind: Literal["characters", "uniform", "free-swing"] = "characters"
     """How to sample the scene."""
     samples: Unstated[int] = None
@@ -35,7 +36,7 @@ class Arguments:
     dt: Unstated[float] = None
     """characters, free-swing: time between samples, s (default: 0.04 for characters, 0.02 for free-swing)."""
     seed: Unstated[int] = None
-    """uniform, free-swing: seed of all random numbers (default: 0)."""
+    """uniform, free-swing: seed for all random numbers (default: 0)."""
     overwrite: bool = False
     """Replace the file if it exists."""
 
@@ -46,6 +47,8 @@ def main(options: Arguments) -> None:
     from dln_jax.scenes.datasets import generators
     from dln_jax.scenes.registry import scene_named
 
+    if options.out.exists() and not options.overwrite:
+        raise InputError(f"{options.out} already exists; choose another --out, or add --overwrite")
     scene, kind = scene_named(options.scene), options.kind
     unused = {name for names in OF_KIND.values() for name in names} - set(OF_KIND[kind])
     refuse_given(options, sorted(unused), f"not used for --kind {kind}")

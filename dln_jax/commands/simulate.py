@@ -1,14 +1,15 @@
-"""Simulate a soft body by implicit time steps: a cantilever, a twisted bar, a sliding block, a falling body, a crawler.
+"""Simulate a soft body with implicit time steps.
 
-Prints the speed and how well the steps were solved, and writes a run folder: motion.gif (and motion.mp4 if ffmpeg is
-installed), energy.png (energies against time, which show what the implicit step damps), moments.png, metrics.json,
-report.json and config.json. Bodies have 1000 kg/m³; in the plane they are 1 m thick.
+Scenes: a cantilever, a twisted bar, a sliding block, a falling body and a crawler. Prints the speed and how accurately
+the steps were solved. The run folder gets motion.gif (motion.mp4 too with ffmpeg), energy.png (energies against time,
+which show what the implicit step damps), moments.png, metrics.json, report.json and config.json. The density is 1000
+kg/m³; bodies in the plane are 1 m thick.
 
-Your own mesh: --mesh FILE for the scenes beam and drop, with the last axis up. Formats: .msh of Gmsh (2.2 and 4.1)
-and, with the extra [mesh], .vtk, .vtu, .obj and TetGen's .ele. Tetrahedra form a body in space, triangles with constant
-z a body in the plane; physical groups become named sets, for --pin. The command prints what it left out or repaired.
-An .npz has `vertices` [n, 2 or 3] in m, `elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0) and, for the
-beam, optionally `held` [k] (vertices; by default those of the smallest x).
+For your own mesh, add --mesh FILE to the scenes beam and drop; its last axis points up. Formats: .msh of Gmsh (2.2 and
+4.1) and, with the extra [mesh], .vtk, .vtu, .obj and TetGen's .ele. Tetrahedra form a body in space, triangles with
+constant z a body in the plane. Physical groups become named sets, for --pin. The command prints what it left out or
+repaired. An .npz has `vertices` [n, 2 or 3] in m, `elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0) and,
+for the beam, optionally `held` [k] (vertices; by default those with the smallest x).
 """
 
 import dataclasses
@@ -33,19 +34,19 @@ class Arguments(Folder, Drawn):
     """backward-euler damps, bdf2 (second order) damps little, midpoint (second order) does not damp,
     average-vector-field (second order) keeps the energy."""
     dt: Unstated[float] = None
-    """Time step in s."""
+    """Time step, s (default: the scene's)."""
     seconds: Unstated[float] = None
-    """Duration of the motion in s."""
+    """Duration of the motion, s (default: the scene's)."""
     cells: Unstated[int] = None
     """Cells across the body (drop: rings of the disc); not for the creature."""
     dimension: Unstated[int] = None
     """beam, drop: 2 or 3."""
     youngs_modulus: Unstated[float] = None
-    """E in Pa; not for the creature."""
+    """Young's modulus, Pa; not for the creature."""
     poisson_ratio: Unstated[float] = None
-    """Between -1 and 0.5; not for the creature."""
+    """Poisson's ratio, between -1 and 0.5; not for the creature."""
     material: Unstated[Literal["stable-neo-hookean", "neo-hookean", "st-venant-kirchhoff", "corotated"]] = None
-    """Not for the creature (default: stable-neo-hookean)."""
+    """Strain energy; not for the creature (default: stable-neo-hookean)."""
     order: Unstated[int] = None
     """1: linear elements (default); 2: quadratic elements, which do not lock in bending. Not for the creature."""
     mixed: bool = False
@@ -83,7 +84,7 @@ def main(options: Arguments) -> None:
     from dln_jax.metrics.report import conditions, write_report
     from dln_jax.precision import data_type
     from dln_jax.runs.folder import command_folder
-    from dln_jax.runs.report import Report, finish
+    from dln_jax.runs.report import Report, finish, rows_of
     from dln_jax.softbody.examples import EXAMPLES
     from dln_jax.softbody.mesh.files import write_motion
 
@@ -98,6 +99,7 @@ def main(options: Arguments) -> None:
             announce(prepared, options)
             motion = run_motion(prepared, precision)
             rows = results(name, mesh, motion)
+            numbers = {row.quantity: row.value for row in rows}
             dtype = jnp.dtype(precision).name
             facts = conditions(dtype=dtype, seeds=[0], integrator=options.integrator, dt=dt)
             write_report(own / "report.json", rows, facts)
@@ -106,18 +108,10 @@ def main(options: Arguments) -> None:
                 moving = mesh, motion.t[shown], motion.x[shown], motion.v[shown]
                 write_motion(own / "motion.pvd", *moving, stride=motion.stride)
             pictures.append(moments_of(name, example, motion))
-            table = [
-                (
-                    LABELS.get(row.quantity, row.quantity.replace("_", " ")),
-                    f"{row.value:.4g}",
-                    "" if row.unit == "1" else row.unit,
-                )
-                for row in rows
-            ]
             title = f"{name}: {options.integrator}, dt = {dt:.4g} s"
             report = Report(
-                metrics={row.quantity: row.value for row in rows if math.isfinite(row.value)},
-                rows=table,
+                metrics={name: value for name, value in numbers.items() if math.isfinite(value)},
+                rows=rows_of(numbers, LABELS, {row.quantity: row.unit for row in rows}),
                 title="",
                 lines=tuple(warnings(motion)),
                 figures=figures_of(name, example, motion, pictures[-1], title),

@@ -1,10 +1,11 @@
-"""Run one command over a grid of its options, each combination as a job of its own, here, by Slurm or by Ray.
+"""Run a command for every combination of options.
 
-The grid is for example 'width=8,16 seed=0:10 data=a.npz,b.npz': commas separate values, a:b and a:b:step are whole
-numbers without b, and all combinations run. Options are checked before anything starts. A sweep's folder gets a folder
-for each job, table.csv with all their metrics, sweep.json and sweep.png: error against seconds, and the best by
-validation alone. Jobs that fail are listed with their error message, and the exit status is 1; --resume runs only the
-jobs that are not done. slurm needs the extra [sweep], ray the extra [ray]; hosts must share the sweep's folder.
+Jobs run on this machine, or with Slurm or Ray. An example of a grid is 'width=8,16 seed=0:10 data=a.npz,b.npz': commas
+separate values, and a:b and a:b:step are whole numbers below b. Options are checked before anything starts. The folder
+of the sweep gets a folder for each job, table.csv with all metrics, sweep.json and sweep.png, which shows error against
+seconds and marks the best job by validation. Failed jobs are listed with their error message, and the exit status is 1;
+--resume runs only the unfinished jobs. Slurm needs the extra [sweep], Ray the extra [ray], and all hosts must share the
+sweep's folder.
 """
 
 import importlib
@@ -16,7 +17,7 @@ from typing import ClassVar, Literal
 from dln_jax.commands import COMMANDS
 from dln_jax.errors import InputError
 from dln_jax.options import Resumable, Unstated
-from dln_jax.runs.arguments import names_in, require_positive_if_given
+from dln_jax.runs.arguments import closest, names_in, require_positive_if_given
 
 
 @dataclass(frozen=True)
@@ -30,32 +31,32 @@ class Arguments(Resumable):
     grid: Unstated[str] = None
     """Options and their values: 'width=8,16 seed=0:10'."""
     fixed: str = ""
-    """Options that all jobs have: 'steps=500 figures=no test=e,q,v'; a comma is part of the value."""
+    """Options that all jobs share: 'steps=500 figures=no test=e,q,v'; commas belong to the value."""
     where: Unstated[Literal["here", "slurm", "ray", "later"]] = None
-    """What runs the jobs: processes on this machine, an array of the Slurm cluster, or Ray. later only writes the jobs'
-    command lines, for any other scheduler (default: here)."""
+    """Where jobs run: as processes on this machine, as an array of the Slurm cluster, or with Ray. later only writes
+    the command lines, for another scheduler (default: here)."""
     jobs: Unstated[int] = None
-    """Jobs at once (default: as many as there are cores; with Slurm, as many as it allows). Jobs that run side by side
-    slow each other down."""
+    """Number of jobs at once (default: one for each core; with Slurm, as many as it allows). Jobs that run at the same
+    time slow each other down."""
     gpus: Unstated[int] = None
-    """here and ray: accelerators of this machine; each job has one to itself (default: 0, jobs see none)."""
+    """here and ray: number of GPUs of this machine; each job has one to itself (default: 0)."""
     slurm: Unstated[str] = None
     """Options of sbatch: 'partition=gpu time=60 gpus_per_node=1', time in minutes (default: 60). A job that reaches its
     time limit is queued again and continues."""
     metric: Unstated[str] = None
     """Metric of metrics.json that chooses the best job (default: the command's validation error)."""
     best: Unstated[Literal["smallest", "largest"]] = None
-    """Which --metric is the best (default: smallest)."""
+    """Whether the smallest or the largest --metric is best (default: smallest)."""
     error: Unstated[str] = None
-    """Metric that is shown beside it and does not affect the choice (default: the command's test error)."""
+    """Metric shown beside --metric, without influence on the choice (default: the command's test error)."""
     over: Unstated[str] = None
-    """Options, separated by commas, over which medians and the worst are taken (default: seed)."""
+    """Comma-separated options over which medians and worst values are taken (default: seed)."""
 
 
 def main(options: Arguments) -> None:
     """Checks the grid, runs the jobs and shows the results; raises `SystemExit` with 1 if a job is not done."""
     from dln_jax.commands.sweeps.executors import cores, here, ray, run, slurm
-    from dln_jax.commands.sweeps.jobs import closest, grid_of, jobs_of, pairs, status_of
+    from dln_jax.commands.sweeps.jobs import grid_of, jobs_of, pairs, status_of
     from dln_jax.commands.sweeps.results import compare, print_results, sweep_figure, write_tables
     from dln_jax.files import write_figure
     from dln_jax.runs.folder import command_folder
@@ -64,7 +65,9 @@ def main(options: Arguments) -> None:
     require_positive_if_given(options, ("jobs", "gpus"))
     grid, fixed, where = grid_of(options.grid or ""), pairs("--fixed", options.fixed), options.where or "here"
     if options.jobs is not None and options.jobs > (options.gpus or options.jobs):
-        raise InputError(f"--jobs {options.jobs} for --gpus {options.gpus}; each job has one: give fewer jobs")
+        raise InputError(
+            f"--jobs {options.jobs} for --gpus {options.gpus}; each job needs its own GPU; give fewer jobs"
+        )
     over = ["seed"] if "seed" in grid else []
     if options.over is not None:
         over = names_in("--over", options.over.replace("-", "_"), grid)
@@ -73,8 +76,7 @@ def main(options: Arguments) -> None:
     pairs("--slurm", options.slurm or "")
     command, known = options.command.replace("-", "_"), [name for name in COMMANDS if name != "sweep"]
     if command not in known:
-        like = closest(command, known)
-        raise InputError(f"--command: there is no {command!r:.40}{like} (see python -m dln_jax --help)")
+        raise InputError(f"--command: there is no {command!r:.40}{closest(command, known)} (see dln-jax --help)")
     arguments = importlib.import_module(f"dln_jax.commands.{command}").Arguments
     jobs_of(command, arguments, grid, fixed, Path())  # mistakes are refused before there is a folder
     at_once = options.jobs or (None if where == "slurm" else options.gpus or cores())
@@ -85,8 +87,8 @@ def main(options: Arguments) -> None:
         if where == "later":
             lines = folder / "jobs.sh"
             lines.write_text("".join(f"{shlex.join(job.line(job.folder / 'run'))}\n" for job in left))
-            print(f"{len(left)} jobs, a line each in {lines}, to be run from {Path.cwd()}")
-            print(f"the table is made by: --out {folder} --resume --where here")
+            print(f"{lines} has the command lines of {len(left)} jobs; run them from {Path.cwd()}")
+            print(f"make the table with --out {folder} --resume --where here")
             return
         if left:
             if where == "slurm":

@@ -1,13 +1,14 @@
-"""Swing up a pole with a model that was learned from it: explore the plant, learn, design a controller, close the loop.
+"""Swing up a pole with a model learned from its motion.
 
-The plant is an MJCF or URDF file: a cart-pole, a rotary pendulum, an acrobot, a pendubot, or another chain with a
-passive joint; cart-pole and rotary-pendulum name two files of the library, desktop plants with dry friction. MuJoCo
-simulates it, with encoders and torques that act a sample late. It is explored without a model; only q and the commanded
-torques are recorded. Models: identified (rigid bodies, linear in its parameters), delan (a structured deep Lagrangian
-network with friction), known (the file's bodies and friction), analytic (the same without friction). Trials of the
-model choose all gains, and the law gets its states from a Kalman filter of the model.
+Explores the plant, learns a model, designs a controller, and closes the loop. The plant is an MJCF or URDF file: a
+cart-pole, a rotary pendulum, an acrobot, a pendubot, or another chain with a passive joint. cart-pole and
+rotary-pendulum name two files of the library, desktop plants with dry friction. MuJoCo simulates the plant, with
+encoders and torques that act one sample late. The exploration needs no model and records only q and the commanded
+torques. Models: identified (rigid bodies, linear in their parameters), delan (a structured deep Lagrangian network with
+friction), known (the file's bodies and friction), analytic (the same without friction). Simulated trials choose all
+gains, and a Kalman filter estimates the states.
 
-A run folder gets data.npz, the model, law.json, metrics.json, config.json, and a figure of the runs.
+The run folder gets data.npz, the model, law.json, metrics.json, config.json, and a figure of the runs.
 """
 
 from dataclasses import dataclass
@@ -30,18 +31,17 @@ class Arguments(Folder, Drawn):
     model: Literal["identified", "delan", "known", "analytic"] = "identified"
     """Model for the design of the controller."""
     estimator: Literal["extended", "unscented", "differences"] = "extended"
-    """Where the law's states come from: a Kalman filter of the encoders' readings, or their differences."""
+    """Source of the states: an extended or unscented Kalman filter, or differences of the encoder readings."""
     recover: Literal["swing-up", "plans"] = "swing-up"
-    """How the plant comes up again after a push: as from hanging, or by plans from the state after the push, which are
-    improved on the way."""
+    """How to recover from a push: swing up again, or replan on the way."""
     push: float = 0.0
-    """Jump of the passive joints' rates in the middle of every run, 5 s after its start, rad/s (default: no push)."""
+    """Jump of the passive joints' velocities in the middle of every run, rad/s."""
     seconds_of_data: float = 30.0
-    """Seconds of motion to learn from, at least 12, including an episode for validation."""
+    """Duration of the motion to learn from, at least 12 s, including an episode for validation."""
     starts: int = 100
     """Number of starts near hanging at rest."""
     seed: int = 0
-    """Seed of the exploration, the network's initial parameters, the starts and the noise."""
+    """Seed for the exploration, the network's initial parameters, the starts and the noise."""
 
 
 def main(options: Arguments) -> None:

@@ -1,9 +1,10 @@
-"""Train a model of dynamics on trajectories (q, qd, qdd, tau), and report its errors, its rollouts and its speed.
+"""Train a model of dynamics on a log with torques.
 
 Models: structured-delan (a deep Lagrangian network, M = L Lᵀ), black-box-delan (a network is the Lagrangian),
-trigonometric (linear in its parameters), trigonometric-kernel (the same as a Gaussian process), learned-tree (an arm's
-bodies and joint frames), feed-forward (no physics), auto (model selection). --model NAME --help shows the options of a
-model. Without --data, a two-link arm writes 20 letters. Load the run with dln_jax.load.
+trigonometric (linear in its parameters), trigonometric-kernel (the same as a Gaussian process), learned-tree (rigid
+bodies with unknown joint frames), feed-forward (no physics), auto (model selection). --model NAME --help shows the
+options of a model. Without --data, a two-link arm writes 20 letters. The table reports errors, rollouts and speed. Load
+the run with dln_jax.load.
 """
 
 import dataclasses
@@ -41,19 +42,19 @@ class Plant(Drawn, Resumable, Filtered):
     """Data and what they show, and where the results go."""
 
     data: Unstated[Path] = None
-    """Trajectories: npz, CSV, bag (default: letters or --scene)."""
+    """Trajectories as npz, CSV or ROS bag (default: letters)."""
     test: Unstated[str] = None
-    """Test trajectories: labels, comma separated; last:30% of every trajectory; or ten blocks of time in each (default:
+    """Test trajectories: comma-separated labels; last:30% of each; or blocks, for ten blocks of time in each (default:
     e,q,v, else every sixth, else blocks)."""
     scene: Unstated[SceneName] = None
-    """Textbook scene that states the needs, such as chain-3; sampled without data."""
+    """Textbook system, such as chain-3, which states the needs and, without --data, gives the data."""
     needs: Unstated[str] = None
     """Joints and terms, such as 'rp friction' for a revolute and a prismatic joint, or as JSON (default: the scene's or
     file's, else revolute, gravity, friction)."""
     seed: int = 0
-    """Seed of parameters, shuffling and validation."""
+    """Seed for parameters, shuffling and validation."""
     uncertainty: bool = True
-    """Estimate the uncertainty of the torques, and flag states out of distribution."""
+    """Estimate the uncertainty of the torques, which also flags states out of distribution."""
 
 
 @dataclass(frozen=True)
@@ -182,8 +183,6 @@ def train(options: Options, command: str) -> None:
             fit.save(folder)
         report = evaluate(fit, parts, log, mesh=mesh)
         limited = seconds is not None or (isinstance(options, Network) and options.steps is not None)
-        if report.error:
-            report = report._replace(error=report.error.replace("the model", str(folder), 1))
         finish(folder, options, report._replace(ended_by_user=fit.optimiser is not None and limited))
 
 

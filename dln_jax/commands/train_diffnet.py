@@ -1,8 +1,10 @@
-"""Train a deep differential network, or an ensemble, on a function: value, gradient and Hessian from one pass.
+"""Train a network on a function and its derivatives.
 
-Functions: sin (1-D), cos_sin (cos x1 sin x2), both with the published noise, or your own npz file with x [N, n],
-y [N, m] and optional dy, d2y. A run folder gets config.json, metrics.json, model.safetensors and model.json (load them
-with dln_jax.load), and figures. `python -m scripts.report diffnet table` has the published activations and losses.
+A deep differential network, or an ensemble of them, gives value, gradient and Hessian in one pass. Functions: sin
+(1-D) and cos_sin (cos x1 sin x2), both with the published noise, or your own npz file with x [N, n], y [N, m] and
+optional dy, d2y. The run folder gets config.json, metrics.json, model.safetensors and model.json (load them with
+dln_jax.load), and figures. In the repository, `python -m scripts.report diffnet table` compares the published
+activations and losses.
 """
 
 from dataclasses import dataclass
@@ -24,8 +26,7 @@ UNITS = {
     "value_mse": "y²",
     "gradient_mse": "(y / x)²",
     "hessian_mse": "(y / x²)²",
-    "spread_inside": "y",
-    "spread_outside": "y",
+    "spread": "y",
     "validation_loss": "units of the fit",
 }
 """Units of metrics, from the units x and y of the data."""
@@ -95,16 +96,14 @@ def main(options: Arguments) -> None:
     from dln_jax.runs.devices import mesh_of
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
-    from dln_jax.runs.report import Report, cost_metrics, finish, number, png, unit_of
+    from dln_jax.runs.report import Report, cost_metrics, finish, png, rows_of
     from dln_jax.scale import device_lines
-    from dln_jax.types import require_seed
     from dln_jax.zoo.descriptions import describe
     from dln_jax.zoo.run import load as load_run
     from dln_jax.zoo.run import save
 
     # The samples
     mesh = mesh_of(options)
-    require_seed(options.seed)
     function, seed, is_named = options.function, options.seed, options.function in NAMES
     newton, several = options.optimizer == "gauss-newton", options.ensemble > 1
     sampling, box, remarks = {}, None, ()
@@ -232,10 +231,10 @@ def main(options: Arguments) -> None:
         metrics |= cost_metrics(training, latency, parameters=parameters, best_step=training.best_step)
         lines = (RELU,) if network.activation == "relu" else ()
         if training.stop.reason == "not finite":
-            lines = ("the loss stopped being finite; the run keeps the best parameters before that", *lines)
+            lines = ("the loss stopped being finite; the best parameters before that are kept", *lines)
         report = Report(
             metrics=metrics | {"verdict": verdict.number},
-            rows=[(key.replace("_", " "), number(key, value), unit_of(key, UNITS)) for key, value in metrics.items()],
+            rows=rows_of(metrics, units=UNITS),
             title=f"test on {function}, {network.precision}",
             verdict=verdict,
             ended_by_user=bool(options.steps or options.epochs),

@@ -1,9 +1,10 @@
-"""Train a Hamiltonian network on trajectories with torques, and report its errors, its rollouts and its speed.
+"""Train a Hamiltonian network on a log with torques.
 
 Models: structured-hnn (H = ½ pᵀ M⁻¹(q) p + V(q)) and black-box-hnn (a network is H). Data with momenta p are fitted in
-Hamilton's equations, (q, p, tau) -> (qd, qdd); without them torques are fitted, through the Legendre transform. Errors
-are those of torques and accelerations in coordinates and velocities, as for every model. Without --data it trains on
-the embedded letters; a run folder gets what train_delan writes. Motions without applied forces are for train_hnn_task.
+Hamilton's equations, (q, p, tau) -> (qd, qdd). Without momenta, torques are fitted through the Legendre transform. The
+table reports errors of torques and accelerations in coordinates and velocities, as for every model. Without --data, it
+trains on the built-in letters. The run folder gets the same files as that of train_delan. For motions without applied
+forces use train_hnn_task.
 """
 
 from dataclasses import dataclass

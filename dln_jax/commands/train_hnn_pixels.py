@@ -1,7 +1,8 @@
-"""Train a Hamiltonian network, or a plain one, on films of a pendulum: an autoencoder with an energy in its plane.
+"""Train a Hamiltonian network on films of a pendulum.
 
-The films are generated: 28 x 28 pixels of a swinging rod. A run folder gets config.json, metrics.json,
-model.safetensors and model.json (load them with dln_jax.load), a checkpoint to --resume from, and figures.
+An autoencoder maps the films to a plane, in which a Hamiltonian or a plain network gives the motion. The films are
+generated: 28 x 28 pixels of a swinging rod. The run folder gets config.json, metrics.json, model.safetensors and
+model.json (load them with dln_jax.load), a checkpoint for --resume, and figures.
 """
 
 from dataclasses import dataclass
@@ -18,11 +19,11 @@ class Arguments(Drawn, Resumable):
     model: Literal["black-box-hnn", "phase-network"] = "black-box-hnn"
     """An energy in the latent plane, or a network that gives the rates there."""
     trajectories: Unstated[int] = None
-    """Generated films (default: as published)."""
+    """Number of generated films (default: as published)."""
     steps: Unstated[int] = None
-    """Steps of adam (default: those of the published recipe)."""
+    """Steps of Adam (default: as published)."""
     seed: int = 0
-    """Seed of parameters and shuffling."""
+    """Seed for parameters and shuffling."""
 
 
 def main(options: Arguments) -> None:
@@ -38,16 +39,14 @@ def main(options: Arguments) -> None:
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import Report, finish, png, rows_of
-    from dln_jax.types import require_seed
     from dln_jax.zoo.descriptions import build
     from dln_jax.zoo.run import save
 
-    require_seed(options.seed)
     require_positive_if_given(options, ["steps", "trajectories"])
     kind, adam = options.model, optimiser(options.steps)
     train, validation, test = swinging_rod(options.trajectories or TRAJECTORIES)
     with command_folder(options, "train_hnn_pixels") as folder:
-        print(f"pixels: {len(train.q)} films to train on, {len(validation.q)} to select by; {kind}, f32")
+        print(f"pixels: {len(train.q)} films for training, {len(validation.q)} for validation; {kind}, f32")
         known = identity(adam, [train.frames, validation.frames], model=kind, seed=options.seed)
         with progress(adam.steps) as show:
             description, parameters, training = fit(

@@ -1,15 +1,17 @@
-"""Train a Hamiltonian model of motions without applied forces, (q, p) -> (qd, pd), and report how it predicts them.
+"""Train a Hamiltonian model on motions without forces.
 
-Tasks are the published spring, pendulum, real-pendulum (--data), two-body and three-body; damped-spring,
-damped-pendulum, henon-heiles and double-pendulum; and measured: any --data in the npz schema, with q, qd or only q,
-whose windows never cross a gap. Models: auto (the one that suits the scene), separable-hnn (T(p) + V(q)),
-structured-hnn, black-box-hnn, pairwise-hnn (bodies), polynomial-hamiltonian (one least-squares problem), phase-network
-(a network gives the rates) and helmholtz-hnn (the gradients of two networks give them, friction included). Friction is
-learned where the needs state it. Load the model with dln_jax.load.
+The model gives the rates (q, p) -> (qd, pd), and the table reports how well it predicts motions. Tasks are the
+published spring, pendulum, real-pendulum (--data), two-body and three-body; damped-spring, damped-pendulum,
+henon-heiles and double-pendulum; and measured: any --data in the npz schema with q, qd or only q, whose windows never
+cross a gap. Models: auto (the one that suits the scene), separable-hnn (T(p) + V(q)), structured-hnn, black-box-hnn,
+pairwise-hnn (bodies), polynomial-hamiltonian (one least-squares problem), phase-network (a network gives the rates) and
+helmholtz-hnn (the gradients of two networks give them, with friction). Friction is learned if the needs state it. Load
+the model with dln_jax.load.
 """
 
+import functools
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -62,14 +64,14 @@ class Motion(Drawn, Scaled, Limited, Resumable):
         "trigonometric",
         "planar-chain",
     ] = "auto"
-    """Model to learn; auto: the one that suits the task, for measured the smallest whose validation error no other
-    beats. The last three are for measured."""
+    """Model to learn. auto takes the one that suits the task; for measured, the smallest that no other improves
+    significantly. The last three are for measured."""
     optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
-    """auto: gauss-newton."""
+    """Optimiser; auto is gauss-newton."""
     steps: Unstated[int] = None
-    """Steps of each stage (default: the task's)."""
+    """Iterations of each stage (default: the task's)."""
     seed: int = 0
-    """Seed of parameters, shuffling and validation split."""
+    """Seed for parameters, shuffling and validation."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ class Networks:
     activation: Unstated[ActivationName] = None
     """Activation of the hidden layers (default: tanh)."""
     field: Unstated[Literal["solenoidal", "conservative", "both"]] = None
-    """helmholtz-hnn: the part that conserves an energy, the gradient, or both (default: both)."""
+    """helmholtz-hnn: the solenoidal part conserves an energy, the conservative one is a gradient (default: both)."""
     learning_rate: Unstated[float] = None
     """adam: peak of the warm-up and cosine schedule (default: 0.005)."""
 
@@ -125,35 +127,16 @@ class Direct:
     """planar-chain: joint angles, or angles from the vertical (default: relative)."""
 
 
-@dataclass(frozen=True)
-class GeneratedNetwork(Networks, Generated, Motion):
-    """A network, and generated motions to train it on."""
-
-
-@dataclass(frozen=True)
-class GeneratedDirect(Direct, Generated, Motion):
-    """A model without a network, and generated motions to fit it to."""
-
-
-@dataclass(frozen=True)
-class RecordedNetwork(Networks, Recorded, Motion):
-    """A network, and recorded motions to train it on."""
-
-
-@dataclass(frozen=True)
-class RecordedDirect(Direct, Recorded, Motion):
-    """A model without a network, and recorded motions to fit it to."""
-
-
-Options = GeneratedNetwork | GeneratedDirect | RecordedNetwork | RecordedDirect
-
-
 def class_of(stated: Mapping[str, Any]) -> type:
     """Options of the task and the model that a command line selects."""
-    network, direct = GeneratedNetwork, GeneratedDirect
-    if stated.get("task") in RECORDED:
-        network, direct = RecordedNetwork, RecordedDirect
-    return direct if stated.get("model") in DIRECT else network
+    model = Direct if stated.get("model") in DIRECT else Networks
+    return options_of(model, Recorded if stated.get("task") in RECORDED else Generated)
+
+
+@functools.cache
+def options_of(model: type, motions: type) -> type:
+    """Options of models of one kind, fitted to motions of one kind."""
+    return make_dataclass("Options", [], bases=(model, motions, Motion), frozen=True)
 
 
 @dataclass(frozen=True)
@@ -171,7 +154,7 @@ class Arguments(Motion):
     )
 
 
-def main(options: Options) -> None:
+def main(options: Any) -> None:
     """Trains and evaluates the model, and writes the run folder.
 
     Raises:
@@ -185,27 +168,24 @@ def main(options: Options) -> None:
     from dln_jax.learning.engine.checkpoint import Context
     from dln_jax.learning.engine.optimisers import optimiser_named
     from dln_jax.process import deadline
-    from dln_jax.runs.arguments import facts, needs_of, numbers_of, require_positive_if_given
+    from dln_jax.runs.arguments import facts, needs_of, numbers_of, refuse_given, require_positive_if_given
     from dln_jax.runs.devices import mesh_of
     from dln_jax.runs.folder import command_folder
     from dln_jax.runs.progress import progress
     from dln_jax.runs.report import finish
-    from dln_jax.types import require_seed
     from dln_jax.zoo.run import save
 
     until, mesh = deadline(options.seconds), mesh_of(options)
-    require_seed(options.seed)
     require_positive_if_given(options, ["width", "depth", "degree", "steps", "trajectories", "seconds"])
     for name, (choice_of, *values) in READ_FOR.items():
-        if getattr(options, name, None) is not None and getattr(options, choice_of) not in values:
-            option = f"--{name.replace('_', '-')}"
-            raise InputError(f"{option} is an option of --{choice_of} {values[0]}; add that, or leave {option} out")
+        if hasattr(options, name) and getattr(options, choice_of) not in values:
+            refuse_given(options, [name], f"an option of --{choice_of} {values[0]}")
     optimizer, names = options.optimizer, ("width", "depth", "activation", "field", "degree", "coordinates", "order")
     keywords = {name: value for name in names if (value := getattr(options, name, None)) is not None}
     networks = optimizer == "adam" or not keywords.keys() <= {"order"}
     name, rate = "gauss-newton" if optimizer == "auto" else optimizer, getattr(options, "learning_rate", None)
     optimiser = optimiser_named(name, precision="f64", learning_rate=rate)
-    if isinstance(options, Recorded):
+    if options.task in RECORDED:
         noise = None if options.noise is None else numbers_of("--noise", options.noise, positive=True)
         known = {"needs": needs_of(options.needs), "test": options.test, "noise": noise}
         log = read_motions(options.task, options.data, **known, **facts(options))
@@ -214,9 +194,9 @@ def main(options: Options) -> None:
     if options.model == POLYNOMIAL:
         if optimizer == "adam":
             raise InputError("the polynomial model is one least-squares problem; leave --optimizer out")
-        for name in ("steps", "seconds", "processes"):
-            if getattr(options, name) is not None and not log.task.trajectory_steps:
-                raise InputError(f"--{name} is for networks; the polynomial model is one least-squares problem")
+        if not log.task.trajectory_steps:
+            words = "for networks: the polynomial model is one least-squares problem"
+            refuse_given(options, ["steps", "seconds", "processes"], words)
     with command_folder(options, "train_hnn_task") as folder:
         context = Context(options.seed, until, print, progress, folder, options.resume, mesh)
         if options.model == "auto" and not log.task.suits:
@@ -227,11 +207,7 @@ def main(options: Options) -> None:
             print(line)
         fit = train(log, description, context, optimiser=optimiser, steps=options.steps)
         save(folder, description, fit.parameters)
-        if options.seconds is not None:
-            print(f"{folder} holds the model; its evaluation follows and is not limited by --seconds")
         report = evaluate(log, fit)
-        if report.error:
-            report = report._replace(error=f"{report.error}; {folder} holds the best model before that")
         finish(folder, options, report._replace(ended_by_user=options.steps is not None or fit.stop == "time"))
 
 
@@ -254,16 +230,16 @@ def lines_on(log: "PhaseLog", description: dict[str, Any]) -> Iterator[str]:
     yield from log.remarks
     if in_velocities(log, description):
         q = ", ".join(f"{coordinate:.3g}" for coordinate in gauge_of(log).q)
-        yield f"p = dL/dqd; without torques an energy is one up to a factor: here the mean inertia at q = ({q}) is 1"
+        yield f"p = dL/dqd; without torques the unit of energy is free: the mean inertia at q = ({q}) is set to 1"
     elif not log.momenta:
-        yield "momenta p are taken as qd, per unit of inertia"
+        yield "momenta p are not in the data; qd takes their place (momentum per unit of inertia)"
     if log.assumed:
-        yield "nothing states the needs: joints, potential and friction above are assumed; --needs states them"
+        yield "no needs are stated, so joints, potential and friction above are assumptions; state them with --needs"
     if log.exact is None and "order" in description:
         example = {"bodies": "x1, y1, x2, y2", "axes": "x1, x2, y1, y2"}[description["order"]]
-        yield f"coordinates are taken as {example}, .. with {description['dimension']} axes; --order states it"
+        yield f"assumed order of coordinates: {example}, ... in {description['dimension']} axes; state another --order"
     if log.weights is not None and log.noise is None:
         noise = ", ".join(f"{sd:.2g}" for sd in np.ravel(log.weights.state))
         free = log.free_of_noise
-        yield f"(q, p): {'states are free of noise' if free else f'motions are weighed by noise of {noise}'}"
+        yield f"(q, p): {'states are free of noise' if free else f'motions are weighted by noise of {noise}'}"
     yield from device_lines("f64")

@@ -1,12 +1,12 @@
-"""Train a policy that moves a soft creature, by gradients through the simulator.
+"""Train a policy that moves a soft creature.
 
-The creature starts on the ground and has an episode of 400 steps of 0.033 s. A policy is judged by how many body
-lengths the mean x of the vertices travels before the creature falls, if it does. The policy observes the body in its
-own frame and a clock, and changes the actuation of the muscles, 0.25 to 1 of their rest length, by at most 0.3 a step.
-Episodes may start perturbed, on slopes or rough ground, and be disturbed by pushes. Then the policy is selected by 16
-walks of five episodes on the steepest slopes, and judged by 100 others of 2,000 steps. A run folder gets config.json,
-metrics.json, the model of the best seed, a figure of the learning, and a GIF of the gait (also an MP4 if ffmpeg is
-installed). evaluate_locomotion judges the policy on other ground.
+Gradients flow through the simulator. The creature starts on the ground and has an episode of 400 steps of 0.033 s. A
+policy is judged by how many body lengths the mean x of the vertices travels before the creature falls. The policy
+observes the body in its own frame and a clock, and changes the actuation of the muscles, 0.25 to 1 of their rest
+length, by at most 0.3 a step. Episodes can start perturbed, on slopes or rough ground, with pushes. The policy is then
+selected by 16 walks of five episodes on the steepest slopes, and judged by 100 others of 2,000 steps. The run folder
+gets config.json, metrics.json, the model of the best seed, a figure of the learning curve, and a GIF of the gait (an
+MP4 too with ffmpeg). Use evaluate_locomotion to judge the policy on other ground.
 """
 
 import math
@@ -34,7 +34,7 @@ class Arguments(Resumable, Drawn, Scaled):
     steps: Unstated[int] = None
     """Environment steps of each seed (default: 400000)."""
     until: Unstated[float] = None
-    """The training of a seed ends at this distance, in body lengths (default: no limit)."""
+    """Stop the training of a seed at this distance, in body lengths (default: no limit)."""
     upright: float = 0.05
     """Weight of the posture in the reward, body lengths per step."""
     speed: float = 0.04
@@ -54,7 +54,7 @@ class Arguments(Resumable, Drawn, Scaled):
     width: int = 64
     """Hidden units of the policy."""
     stored: Unstated[Path] = None
-    """Folder of a run whose policy is trained further, perhaps on other ground (default: a new policy)."""
+    """Folder of a run whose policy is trained further, for example on other ground (default: a new policy)."""
 
 
 def main(options: Arguments, *, lanes: int = 4) -> None:
@@ -65,7 +65,7 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
     """
     import numpy as np
 
-    from dln_jax.commands.locomotion import NAME, SHOWN, judge, learning_figure, load_policy, write_gait
+    from dln_jax.commands.locomotion import LABELS, NAME, SHOWN, UNITS, judge, learning_figure, load_policy, write_gait
     from dln_jax.locomotion.gradient import LANES, GradientSettings, make_policy, shown_walk
     from dln_jax.locomotion.learning import (
         GOAL,
@@ -86,16 +86,15 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
     from dln_jax.scale import device_lines, shares
     from dln_jax.softbody.mesh.shapes import creature_named
     from dln_jax.softbody.terms.creature import TIME_STEP
-    from dln_jax.types import require_positive, require_seed
+    from dln_jax.types import require_positive
     from dln_jax.zoo.parameter_files import save_tree
     from dln_jax.zoo.run import MODEL
 
     mesh, settings = mesh_of(options), GradientSettings(options.width, options.window, lanes)
     require_positive(seeds=options.seeds, episode=options.episode, **settings._asdict())
     require_positive_if_given(options, ["steps", "until"])
-    require_seed(options.seed, options.seeds)
     for name in ("upright", "speed"):
-        if not 0 <= getattr(options, name) < math.inf:
+        if getattr(options, name) < 0:
             raise InputError(f"--{name} is {getattr(options, name)}; expected 0 or a positive number")
     shares(mesh, lanes, LANES)
     clock_period, initial = CLOCK_PERIOD, None
@@ -141,9 +140,7 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
             )
         best = max(trained, key=lambda seed: rank(seed.selected))
         if not math.isfinite(best.distance):
-            raise InputError(
-                f"no evaluation converged; {folder} holds no model: lower the number of steps or the width"
-            )
+            raise InputError(f"no evaluation converged, so {folder} holds no model; lower --steps or --width")
         facts = {"name": NAME, "creature": task.creature.name, "precision": "f64", "clock_period": task.clock_period}
         facts |= {"variation": task.variation._asdict(), "settings": settings._asdict()}
         save_tree(folder, MODEL, best.parameters, {"model": facts})
@@ -169,7 +166,7 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
         if any(task.variation):
             trials = perturbed_trials(task, policy, best.parameters)
             verdict = judge(trials)
-            metrics |= {**numbers_of(trials), "verdict": float(verdict.number)}
+            metrics |= {**numbers_of(trials), "verdict": verdict.number}
             lines = (verdict.line,)
         title = f"{options.creature}, gradient"
         shown = f"{title}: {best.distance:.2f} body lengths"
@@ -177,4 +174,4 @@ def main(options: Arguments, *, lanes: int = 4) -> None:
             "learning.png": png(learning_figure, curves),
             "gait.gif": lambda path: write_gait(path, task, seen, shown),
         }
-        finish(folder, options, Report(metrics, rows_of(metrics), title, lines=lines, figures=figures))
+        finish(folder, options, Report(metrics, rows_of(metrics, LABELS, UNITS), title, lines=lines, figures=figures))

@@ -1,13 +1,14 @@
-"""Train a value function: the cost to go of a plant as a network, whose slope is the best control in closed form.
+"""Train a value function and its optimal control law.
 
-Trains by fitted value iteration, or on the residual of the Hamilton-Jacobi-Bellman equation, prints how long that took
-and what the law costs from 100 starts near hanging and 100 anywhere, and writes a run folder: value.safetensors and
-value.json (dln_jax.load(folder).value), metrics.json, config.json, and figures of V and of the
-closed loop. --out FOLDER --resume continues an interrupted run.
+The value function is the cost to go of a plant as a network, whose gradient gives the optimal control. It is trained by
+fitted value iteration, or on the residual of the Hamilton-Jacobi-Bellman equation. The table reports the training time
+and the cost of the law from 100 starts near hanging and 100 anywhere. The run folder gets value.safetensors and
+value.json (dln_jax.load(folder).value), metrics.json, config.json, and figures of V and of the closed loop. --out
+FOLDER --resume continues an interrupted run.
 
 --plant takes the name of a desktop plant or an MJCF or URDF file, and --run the folder of a learned or identified
-model. Costs, box and times come from the plant's natural scales and limits, and are printed. A law that does not bring
-its starts up is refused with exit status 1, unless your own --iterations ended the training.
+model. Costs, box and times follow from the plant's natural scales and limits, and are printed. A law that fails to
+bring its starts upright is refused with exit status 1, unless your own --iterations ended the training.
 """
 
 from collections.abc import Mapping
@@ -36,13 +37,13 @@ class TrainingOptions:
     weights: Unstated[str] = None
     """Weights of the squared deviations of coordinates and rates (default: by the plant's scales)."""
     effort: Unstated[float] = None
-    """Cost of half the motors' limits over that of hanging (default: 0.25)."""
+    """Cost of half the motors' limits relative to the cost of hanging (default: 0.25)."""
     box: Unstated[str] = None
     """Half widths of the box of coordinates and rates (default: by the plant's scales)."""
     robust: float = 0.0
-    """Train against the worst errors of masses and motors up to this share."""
+    """Train against the worst errors of masses and motors up to this fraction."""
     method: Literal["fitted", "residual"] = "fitted"
-    """fitted: value iteration along trajectories of the model; residual: the equation itself, by Gauss-Newton."""
+    """fitted: value iteration along trajectories of the model; residual: Gauss-Newton on the equation's residual."""
     goal: Unstated[str] = None
     """Posture to hold, rad or m, separated by commas (default: upright)."""
     width: Unstated[int] = None
@@ -54,9 +55,9 @@ class TrainingOptions:
     iterations: Unstated[int] = None
     """Iterations of value iteration (default: 80), or of Gauss-Newton per discount (15)."""
     seed: int = 0
-    """Seed of parameters and states."""
+    """Seed for parameters and states."""
     seeds: int = 1
-    """Number of trainings; the best in validation is kept."""
+    """Number of trainings; the best by validation is kept."""
 
 
 def class_of(stated: Mapping[str, Any]) -> type:
@@ -70,9 +71,9 @@ class Arguments(Scaled, Drawn, Resumable):
 
     VARIANTS: ClassVar = Variants(class_of, {TrainingOptions: "a training, without --stored"})
     starts: int = 100
-    """Number of starts in the evaluation, both hanging and anywhere."""
+    """Number of starts in the evaluation, near hanging and again anywhere."""
     stored: Unstated[Path] = None
-    """Folder of a run whose value function is evaluated on its plant; nothing is trained (default: train one)."""
+    """Folder of a run whose value function is evaluated, without training (default: train one)."""
 
 
 @dataclass(frozen=True)

@@ -131,7 +131,7 @@ def with_uncertainty(fit: Fit, parts: Parts, torque: str, say: Callable[[str], N
         # The model itself is fine, so a failed estimate is reported and left out.
         say(f"no uncertainty is stored: {error}")
         return fit
-    say(f"bands are of {torque}, for one more motion of the kind that was recorded")
+    say(f"Bands cover {torque} of a new motion like the recorded ones.")
     facts = {"ridge": solution.ridge, "degrees_of_freedom": solution.degrees_of_freedom.tolist(), "torque": torque}
     return dataclasses.replace(fit, uncertainty=solution.uncertainty, facts=facts)
 

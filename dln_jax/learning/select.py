@@ -134,7 +134,7 @@ def say_selection(context: Context, title: str, kept: str, ended: str, rows: Seq
         rows: one dictionary per candidate, with its `name`; lists and texts are not shown.
     """
     shown = [key for key in dict.fromkeys(itertools.chain(*rows)) if key not in ("name", "joints", "reason")]
-    table = Table("model", *(key.replace("_", " ") for key in shown), "", title=title)
+    table = Table("model", *(key.replace("_", " ").replace("mse", "MSE") for key in shown), "", title=title)
     for row in rows:
         values = (row.get(key) for key in shown)
         numbers = [
@@ -145,6 +145,6 @@ def say_selection(context: Context, title: str, kept: str, ended: str, rows: Seq
     Console(file=text, highlight=False, soft_wrap=True).print(table)
     context.say(text.getvalue().rstrip())
     if ended:
-        context.say(f"no further model was tried: {ended}")
+        context.say(f"Stopped: {ended}.")
     if context.folder is not None:
         write_json(context.folder / "selection.json", {"kept": kept, "ended": ended, "candidates": list(rows)})

@@ -162,11 +162,11 @@ def judge(errors: HeldOut, names: Sequence[str] | None = None, *, quantity: str 
     if share.mean() >= 1 or unexplained.any() or np.where(unseen, 0.0, share - NOISE * noise).mean() >= FAILED:
         slow = share if errors.slow is None else errors.slow
         if (slow < 1).all() and slow.mean() < min(FAILED, HALF * share.mean()):
-            reason = f"errors are too fast for the motion, {slow.mean():.3g} in means over a quarter period: {numbers}"
+            reason = f"errors are too fast for the motion, nMSE {slow.mean():.3g} over quarter periods: {numbers}"
             return Verdict(
                 "doubtful", reason, "accelerations or torques are noisy: try --cutoff with a lower frequency"
             )
-        beyond = f"more than {FAILED:.0%} of the {quantity} is unexplained in the mean of all joints"
+        beyond = f"more than {FAILED:.0%} of the {quantity} is unexplained on average over the joints"
         constant = f"the {quantity} of {_listed(names, unexplained)} is predicted no better than by a constant"
         remedy = "check the sign, order and unit of tau, and the times of the log (check_data), or record more motions"
         return Verdict("refused", f"{constant if unexplained.any() else beyond}: {numbers}", remedy)
@@ -242,9 +242,9 @@ def judge_motions(
     unit, share = min(1.0, *guessed), 0.0
     if noise is not None:
         share = float(np.mean(np.minimum(noise[counts] / size, 1.0) ** 2))
-    numbers = f"squared error of predicted test motions over the variance {median:.2g}, worst {every[0].max():.2g}"
-    numbers += f" (median of {len(escaped)}; over one period), best guess {unit:.2g}"
-    numbers += (f", noise {share:.2g}" if share else "") + f", rates unexplained {np.max(rates):.2g}"
+    numbers = f"MSE of predicted test motions over the variance: median {median:.2g}, worst {every[0].max():.2g}"
+    numbers += f" ({len(escaped)} motions, one period), best guess {unit:.2g}"
+    numbers += (f", noise {share:.2g}" if share else "") + f", unexplained rates {np.max(rates):.2g}"
     allowed = MOTION_NOISE * share
     if not (median <= FAILED * unit + allowed and median < unit and np.mean(rates) < FAILED + allowed):
         return Verdict("refused", numbers, remedy)
@@ -278,7 +278,7 @@ def verdict_metrics(errors: HeldOut, verdict: Verdict) -> dict[str, float | int]
 
 def _numbers(errors: HeldOut, share: np.ndarray, noise: np.ndarray, names: Sequence[str]) -> str:
     worst = int(np.argmax(share))
-    compared = [f"a guess of zero {np.mean(errors.zero / errors.unit):.3g}"]
+    compared = [f"predicting zero {np.mean(errors.zero / errors.unit):.3g}"]
     compared += [] if errors.file is None else [f"the robot's file {np.mean(errors.file / errors.unit):.3g}"]
     compared += [f"noise {noise.mean():.2g}"] if noise.any() else []
     single = "" if len(share) == 1 else f", worst {names[worst]} {share[worst]:.3g}"

@@ -84,10 +84,7 @@ def arguments_of(arguments: type, **stated: Any) -> Any:
         InputError: an option that the command does not read for these choices.
     """
     whole = arguments_for(arguments, stated)
-    names = {field.name for field in dataclasses.fields(whole)}
-    for name in stated:
-        if name not in names:
-            raise InputError(_unknown(f"--{name.replace('_', '-')}", arguments))
+    _refuse_unknown(stated, (whole,), arguments)
     return whole(**stated)
 
 
@@ -109,8 +106,11 @@ def parse(arguments: type, *, prog: str, description: str | None, line: Sequence
         print(help_text(whole, prog=prog, description=description or "", common=common, every="help_all" in typed))
         raise SystemExit(0)
 
+    see = f" (see {prog} --help)"
+    _refuse_unknown(typed, (whole, common), arguments, see)
+
     def refuse(event: ParseErrorEvent) -> None:
-        raise InputError(f"{_complaint(event, arguments)} (see {prog} --help)")
+        raise InputError(_complaint(event, arguments) + see)
 
     unnamed = tyro.conf.arg(name="")
     both: Any = tuple[Annotated[whole, unnamed], Annotated[common, unnamed]]
@@ -140,9 +140,17 @@ def _complaint(event: ParseErrorEvent, arguments: type) -> str:
         case BadValue():
             return f"{option} lacks a value" if event.offending_value is None else f"{option} takes no value"
     if tokens := getattr(event, "tokens", []):
-        return _unknown(next((token for token in tokens if token.startswith("--")), tokens[0]), arguments)
+        return _unknown(tokens[0], arguments)
     missing = [context.arg.lowered.name_or_flags[-1] for context in getattr(event, "missing_arguments", [])]
     return f"{', '.join(missing)} must be given" if missing else "the options contradict each other"
+
+
+def _refuse_unknown(stated: Iterable[str], kinds: Iterable[type], arguments: type, see: str = "") -> None:
+    """Raises `InputError` for the first name that is no option of these classes."""
+    names = {field.name for kind in kinds for field in dataclasses.fields(kind)}
+    for name in stated:
+        if name.removeprefix("no_") not in names:
+            raise InputError(_unknown(f"--{name.replace('_', '-')}", arguments) + see)
 
 
 def _unknown(option: str, arguments: type) -> str:
@@ -152,11 +160,16 @@ def _unknown(option: str, arguments: type) -> str:
         known = variants.known
     for negated in (name, name.removeprefix("no_")):
         for kind, words in known.items():
-            if negated in {field.name for field in dataclasses.fields(kind)}:
+            if option[:2] == "--" and negated in {field.name for field in dataclasses.fields(kind)}:
                 return f"{option} is an option of {words}; add that, or leave {option} out"
     names = [f"--{field.name.replace('_', '-')}" for kind in (arguments, *known) for field in dataclasses.fields(kind)]
-    like = difflib.get_close_matches(option, names, n=1)
-    return f"unrecognised option: {option:.80}" + (f"; did you mean {like[0]}?" if like else "")
+    return f"unrecognised option: {option:.80}{closest(option, names)}"
+
+
+def closest(word: str, known: Sequence[str]) -> str:
+    """Returns "; did you mean WORD?" for the known word closest to a misspelt one, or nothing."""
+    like = difflib.get_close_matches(word, known, n=1)
+    return f"; did you mean {like[0]}?" if like else ""
 
 
 def names_listed(text: str | None) -> tuple[str, ...]:

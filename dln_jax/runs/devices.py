@@ -55,7 +55,7 @@ def membership_in(options: Any) -> Membership | None:
     host_devices(options.devices)
     member = membership(options.processes, options.coordinator, options.process_id)
     if member is not None and getattr(options, "out", None) is None:
-        raise InputError("several processes share their run's folder; name one that all hosts see, by --out")
+        raise InputError("several processes need --out, a run folder that all hosts can see")
     return member
 
 
@@ -66,7 +66,7 @@ def joined(member: Membership, options: Any, *, seconds: int = JOINING) -> Any:
         InputError: JAX has been used. Errors of `join` end the process with one line and status 2.
     """
     if backend_started():
-        raise InputError("JAX has been used in this process; several are started before it is")
+        raise InputError("JAX has been used in this process; start several processes before that")
     own = {"processes", "coordinator", "process_id", "out", "figures"}
     shared = {
         f"--{key.replace('_', '-')}": str(value) if isinstance(value, Path) else value
@@ -94,7 +94,7 @@ def remedy_of(options: Any) -> str:
     """Advice to the user after a process was lost."""
     if not hasattr(options, "resume"):
         return "start all processes again"
-    return f"continue from the last checkpoint in {getattr(options, 'out', '--out')} with --resume in all processes"
+    return f"continue from the last checkpoint in {options.out} with --resume in all processes"
 
 
 def end_at_once(code: int) -> NoReturn:
@@ -116,17 +116,12 @@ def copied_folder(options: Any, resume: bool) -> Iterator[Path]:
             except (OSError, shutil.Error) as error:
                 reason = getattr(error, "strerror", None) or "not all of it could be read"
                 raise InputError(
-                    f"{options.out}: cannot be copied ({reason}); it must be one that all hosts see"
+                    f"{options.out}: cannot be copied ({reason}); all hosts must see this folder"
                 ) from None
         try:
             yield folder
         except KeyboardInterrupt:
             raise KeyboardInterrupt(options.out) from None
-
-
-def enable_double_precision() -> None:
-    """Turns on float64 for data and references."""
-    jax.config.update("jax_enable_x64", True)
 
 
 def keep_programs(wanted: bool) -> str:
@@ -153,12 +148,13 @@ def keep_programs(wanted: bool) -> str:
 
 
 @functools.cache
-def compilation() -> dict[str, float]:
-    """Totals since the first call of this function, which are updated in place.
+def compilation() -> dict[str, Any]:
+    """Totals since they were last printed, at first since the first call of this function; they are updated in place.
 
-    `seconds` is the compilation time, including programs that came from the cache; `cached` is the number of these.
+    `seconds` is the compilation time, including programs from the cache; `cached` is the number of these; `unkept` is
+    the reason if programs are not kept.
     """
-    counts = {"seconds": 0.0, "cached": 0}
+    counts: dict[str, Any] = {"seconds": 0.0, "cached": 0, "unkept": ""}
 
     def count(event: str, **_: str | int) -> None:
         counts["cached"] += event == "/jax/compilation_cache/cache_hits"
@@ -171,14 +167,15 @@ def compilation() -> dict[str, float]:
     return counts
 
 
-def compilation_summary(since: dict[str, float], unkept: str = "") -> str:
-    """Summary of the compilation since a copy of the totals, in one line; empty if it was short and used no cache."""
-    seconds, cached = (now - since[name] for name, now in compilation().items())
-    if seconds < 0.5 and not cached:
-        return ""
-    many = {0: "no program", 1: "one program"}.get(int(cached), f"{cached} programs")
-    why = f" (none is kept: {unkept})" if unkept else ""
-    return f"compilation took {seconds:.1f} s; {many} came from the cache{why}"
+def print_compilation() -> None:
+    """Prints the time of compilation since the last call, if it is counted, and was long or used the cache."""
+    if not compilation.cache_info().currsize:
+        return
+    seconds, cached, unkept = compilation().values()
+    if seconds >= 0.5 or cached:
+        why = f" (none is kept: {unkept})" if unkept else ""
+        print(f"compilation took {seconds:.1f} s; programs from the cache: {cached}{why}")
+        compilation().update(seconds=0.0, cached=0)
 
 
 def _remove_torn(folder: Path) -> None:

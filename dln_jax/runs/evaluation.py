@@ -19,21 +19,13 @@ from dln_jax.learning.fit import Fit, double
 from dln_jax.learning.linear import design, design_chunks
 from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.errors import (
-    LEVEL,
-    as_arrays,
-    coverage,
-    errors,
-    mean_square,
-    prediction_program,
-    samples_of,
-)
+from dln_jax.metrics.errors import LEVEL, as_arrays, coverage, errors, mean_square, prediction_program, samples_of
 from dln_jax.metrics.latency import latency_of
 from dln_jax.metrics.motions import Motion, by_trajectory, metrics_of_motions, motion_program, records_of
 from dln_jax.models.model import Model
 from dln_jax.models.uncertainty import Uncertainty, deviation_of_rows, exceeds, scores_of_rows
 from dln_jax.precision import compiled
-from dln_jax.runs.report import Report, cost_metrics, number, png, unit_of
+from dln_jax.runs.report import Report, cost_metrics, png, rows_of
 from dln_jax.runs.verdict import verdict_of
 from dln_jax.types import InputError
 
@@ -47,35 +39,41 @@ CEILINGS = {
 }
 """Rollout metrics and the names of the true plant's values."""
 LABELS = {
-    "torque_mse": "torque, mean square error",
-    "test_nmse": "torque, error over variance, mean of joints",
-    "validation_nmse": "the same, on validation motions",
-    "zero_nmse": "the same, of a guess of zero",
-    "noise_nmse": "the same, of the noise of the torques",
-    "file_nmse": "the same, of the robot's file",
-    "forward_mse": "acceleration, mean square error",
-    "validation_error": "validation error, sum over joints",
-    "power_mse": "power, mean square error",
-    "inertial_mse": "inertial force, mean square error",
-    "coriolis_mse": "Coriolis force, mean square error",
-    "gravity_mse": "gravity force, mean square error",
-    "gravity_determined": "gravity told from friction: 1 yes, 0 known only in sum",
-    "smallest_mass_eigenvalue": "smallest eigenvalue of the mass matrix",
-    "share_not_definite": "states where the mass matrix is not definite",
-    "largest_condition_number": "largest condition number of the mass matrix",
-    "coverage_95_share": "torques within the 95 % band",
-    "coverage_95_worst_joint_share": "the same, at the joint furthest from 95 %",
-    "out_of_distribution_share": "states out of distribution",
+    "forward_mse": "acceleration MSE",
+    "inertial_mse": "inertial force MSE",
+    "coriolis_mse": "Coriolis force MSE",
+    "gravity_mse": "gravity force MSE",
+    "gravity_determined": "gravity known apart from friction (1: yes)",
+    "test_nmse": "torque nMSE (MSE over variance)",
+    "validation_nmse": "nMSE on validation motions",
+    "zero_nmse": "nMSE of predicting zero",
+    "noise_nmse": "nMSE of the torque noise (floor)",
+    "file_nmse": "nMSE of the robot's file",
+    "smallest_mass_eigenvalue": "smallest eigenvalue, mass matrix",
+    "share_not_definite": "states with an indefinite mass matrix",
+    "largest_condition_number": "largest condition number, mass matrix",
+    "coverage_95_share": "coverage of the 95 % band",
+    "coverage_95_worst_joint_share": "coverage of the worst joint",
+    "out_of_distribution_share": "share of states out of distribution",
     "vpt_seconds": "valid prediction time, torque held",
-    "vpt_interpolated_seconds": "valid prediction time, torque interpolated",
-    "rollout_seconds": "duration of a test motion",
-    "normalised_state_error": "state error of a rollout, in standard deviations",
+    "vpt_interpolated_seconds": "valid prediction time, interpolated",
+    "rollout_seconds": "length of a test motion",
+    "normalised_state_error": "normalised state error of a rollout",
     "energy_error_j": "energy balance error of a rollout",
-    "one_step_p50_us": "one call of the inverse model, median",
-    "one_step_p99_us": "one call of the inverse model, 99 %",
+    "descents_agreeing": "starts that reached the lowest loss",
+    "descents": "starts of the search",
+    "twin_degrees": "angle between axes of the best starts, degrees",
+    "twin_metres": "distance between axes of the best starts, m",
+    "twin_error": "ratio of the errors of the best starts",
+    "error_over_noise": "MSE over the noise variance",
 }
-"""Labels of metrics; other names explain themselves."""
-UNITS = {"forward_mse": "(1/s²)²", "power_mse": "W²", "normalised_state_error": "1", "energy_error_j": "J"}
+"""Labels of metrics whose names do not explain themselves."""
+UNITS = {
+    "nmse": "1",
+    "power_mse": "W²",
+    "energy_error_j": "J",
+}
+"""Units of metrics other than times and errors of forces."""
 CHUNK = 256
 """Number of samples per call of the program that linearises the torques in the parameters."""
 
@@ -231,20 +229,17 @@ def figures_of(
 def table_of(metrics: dict[str, float | int], fit: Fit) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Columns and rows of the printed table; rollout metrics also show the true plant's values, if it is known."""
     force = "(N m)²" if set(fit.needs.joints) == {"revolute"} else "(N m or N)²"
-    units = {**UNITS, "validation_error": force if fit.objective.selects_by == "torque" else "1"}
-    known = any(ceiling in metrics for ceiling in CEILINGS.values())
-    lines = []
-    for key, value in metrics.items():
-        if key in CEILINGS.values() or key == "verdict":
-            continue
-        unit = "1" if "_nmse" in key else force if "_mse" in key else ""
-        ceiling = metrics.get(CEILINGS.get(key, ""))
-        beside = ["" if ceiling is None else number(key, ceiling)] * known
-        label = LABELS.get(key, key.replace("_", " "))
-        lines.append((label, number(key, value), *beside, units.get(key, unit) or unit_of(key, {})))
-    calls = f"{1e6 / metrics['one_step_p50_us']:,.0f}"
-    lines.append(("calls of the inverse model", calls, *[""] * known, "1/s"))
-    return ("quantity", "value", *["true plant"] * known, "unit"), lines
+    own = {name: value for name, value in metrics.items() if name not in (*CEILINGS.values(), "verdict")}
+    acceleration = force.replace("N m", "rad/s²").replace("N", "m/s²")
+    units = {**UNITS, "forward_mse": acceleration, "mse": force}
+    units["validation_error"] = force if fit.objective.selects_by == "torque" else "1"
+    true = [metrics.get(CEILINGS.get(name, "")) for name in own]
+    known = any(number is not None for number in true)
+    rows = [
+        (label, shown, *["" if number is None else f"{number:.4g}"] * known, unit)
+        for (label, shown, unit), number in zip(rows_of(own, LABELS, units), true, strict=True)
+    ]
+    return ("quantity", "value", *["true plant"] * known, "unit"), rows
 
 
 def choices_of(fit: Fit, parts: Parts, log: Log) -> dict[str, Any]:
@@ -263,14 +258,14 @@ def lines_on(fit: Fit, summed: list[int]) -> Iterator[str]:
     """Lines on the seed that is kept, forces known only in sum, and a training that ended early."""
     if not isinstance(fit.seeds, int):
         by = "cross-validation" if fit.cross_validated else "validation"
-        yield f"the run keeps seed {fit.seeds[fit.best]}, the best in {by}"
+        yield f"the run keeps seed {fit.seeds[fit.best]}, the best by {by}"
     if summed:
-        yield f"gravity and friction of joints {summed} are known only in sum; the potential takes any constant"
+        yield f"gravity and friction of joints {summed} are known only as a sum; constants count as potential"
     stop = fit.training.stop
     if stop.reason == "no improvement":
         yield f"stopped early, at step {stop.step}: the validation error no longer improved"
     if stop.reason == "time":
-        yield f"out of time at step {stop.step}: kept is the best so far; --resume continues"
+        yield f"time is up at step {stop.step}; the best parameters so far are kept, and --resume continues"
 
 
 def failure(fit: Fit) -> str:
@@ -279,4 +274,4 @@ def failure(fit: Fit) -> str:
         return ""
     remedy = "lower --learning-rate or use --precision f64" if isinstance(fit.optimiser, Adam) else "check the data"
     step = fit.training.stop.step
-    return f"the loss stopped being finite after step {step}; the model is the last good one; {remedy}"
+    return f"the loss stopped being finite after step {step}; the last good model is kept; {remedy}"

@@ -28,10 +28,8 @@ CHOSEN = "chosen"
 """Key in config.json of values derived from the arguments."""
 FILES = "files"
 """Key in config.json of the SHA-256 digests of input files, by argument name."""
-SCALE = ("devices", "processes", "coordinator", "process_id")
-"""Arguments that state where a result is computed."""
-PLACES = ("out", "resume", "figures", "uncertainty", *SCALE)
-"""Arguments that do not affect the result."""
+PLACES = ("out", "resume", "figures", "uncertainty", "devices", "processes", "coordinator", "process_id")
+"""Arguments that do not affect the result, such as where it is computed."""
 CHANGEABLE = ("seconds",)
 """Arguments that may change with --resume; a class of arguments may list more in its own `CHANGEABLE`."""
 REMEDY = "restore the file, or train again into another folder"
@@ -89,11 +87,11 @@ def with_stored_arguments(typed: Any, arguments: type) -> Any:
         moved = stored_files(typed).get(key)
         path, option = moved or Path(str(values.get(key))), f"--{key.replace('_', '-')}"
         if not (is_file(path) or is_folder(path)):
-            raise InputError(f"the run in {folder} reads {path}, which is not here; give its new path by {option}")
+            raise InputError(f"the run in {folder} reads {path}, which does not exist; give its new path with {option}")
         if fingerprint(path) != digest:
             raise InputError(
-                f"the run in {folder} was started with other data than {path} has now (SHA-256); give the file it was "
-                f"started with by {option}"
+                f"the data in {path} have changed since the run in {folder} began (SHA-256); give the original file "
+                f"with {option}"
             )
         changes[key] = path
     for key, value in dataclasses.asdict(typed).items():
@@ -168,10 +166,10 @@ def run_folder(out: Path | None, default: str, *, resume: bool = False, resumabl
         folder, created = out, None
     else:
         folder, created = _next_number(Path("runs"), default) if out is None else (out, _create(out))
-        _require_free(folder, resumable)  # before locking, and again below once no other process can write
+        require_free(folder, resumable)  # before locking, and again below once no other process can write
     with locked(folder):
         if created is not None:
-            _require_free(folder, resumable)
+            require_free(folder, resumable)
         try:
             yield folder
         except KeyboardInterrupt as stop:
@@ -239,9 +237,14 @@ def _create(folder: Path) -> list[Path]:
         raise InputError(f"{folder}: cannot create the folder ({error.strerror}); choose another --out") from error
 
 
-def _require_free(folder: Path, resumable: bool) -> None:
+def require_free(folder: Path, resumable: bool) -> None:
+    """Raises `InputError` if a folder exists and holds anything but partial files of a killed process.
+
+    Args:
+        resumable: whether the calling command could continue a run in the folder.
+    """
     try:
-        free = holds_only(folder, LOCK)
+        free = not folder.exists() or holds_only(folder, LOCK)
     except OSError as error:
         raise InputError(f"{folder}: cannot read the folder ({error.strerror}); choose another --out") from error
     if not free:

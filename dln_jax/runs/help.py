@@ -5,7 +5,7 @@ import dataclasses
 import inspect
 import shutil
 import textwrap
-import types
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -32,7 +32,7 @@ RARE = {
     *("mixed", "youngs_modulus_of", "coupled", "velocity_scale"),
 }
 """Options that `--help` leaves out and `--help-all` shows."""
-METAVARS = {int: "INT", float: "NUMBER", str: "TEXT", Path: "PATH"}
+METAVARS = {int: "INT", float: "NUMBER", Path: "PATH"}
 COLUMN = 20
 """Width of the column of options, characters."""
 
@@ -73,27 +73,25 @@ def options_of(arguments: type) -> list[tuple[str, str, str]]:
         usage, default = f"--{field.name.replace('_', '-')}", field.default
         stated = next((mark for mark in marks if hasattr(mark, "metavar")), None)
         kind = get_args(hints[field.name])[0] if marks else hints[field.name]
+        text = stated.help if stated and stated.help else texts[field.name]
         hint = f" (default: {default})"
-        if kind is bool:
-            usage, hint = usage if not default else f"--no-{usage[2:]}", " (default: on)" if default else ""
-        elif default is dataclasses.MISSING:
-            hint = " (required)"
-        elif default is None or (stated and stated.help_behavior_hint == ""):
-            hint = ""
         if kind is not bool:
             usage += f" {stated.metavar if stated and stated.metavar else _metavar(kind)}"
-        text = stated.help if stated and stated.help else texts.get(field.name, "")
-        options.append((field.name, usage, text + hint))
+        elif default is True:
+            usage, text = f"--no-{usage[2:]}", f"Do not {text[0].lower()}{text[1:]}"
+        if default is dataclasses.MISSING:
+            hint = " (required)"
+        elif default is None or kind is bool or (stated and stated.help_behavior_hint == ""):
+            hint = ""
+        options.append((field.name, usage, f"{text.rstrip('.')}{hint}."))
     return options
 
 
 def _metavar(kind: Any) -> str:
-    if get_origin(kind) in (types.UnionType, Literal) or type(kind).__name__ == "Union":
-        members = [member for member in get_args(kind) if member is not type(None)]
-        return _metavar(members[0]) if get_origin(kind) is not Literal else "{" + ",".join(map(str, members)) + "}"
-    if get_args(kind):  # annotated, or a tuple of values
-        return _metavar(get_args(kind)[0])
-    return METAVARS.get(kind, "TEXT")
+    members = [member for member in get_args(kind) if member is not type(None)]
+    if get_origin(kind) is Literal:
+        return "{" + ",".join(map(str, members)) + "}"
+    return _metavar(members[0]) if members else METAVARS.get(kind, "TEXT")
 
 
 def _texts(arguments: type) -> dict[str, str]:
@@ -112,9 +110,10 @@ def _texts(arguments: type) -> dict[str, str]:
 
 
 def _rows(usage: str, text: str, width: int) -> list[str]:
-    head = textwrap.wrap(usage.replace(",", ", "), width, initial_indent="  ", subsequent_indent="      ")
+    wrap = partial(textwrap.wrap, width=width, break_on_hyphens=False)
+    head = wrap(usage.replace(",", ", "), initial_indent="  ", subsequent_indent="      ")
     head = [line.replace(", ", ",") for line in head]
-    body = textwrap.wrap(text, width, initial_indent=" " * COLUMN, subsequent_indent=" " * COLUMN)
+    body = wrap(text, initial_indent=" " * COLUMN, subsequent_indent=" " * COLUMN)
     if len(head[-1]) < COLUMN - 1 and body:
         return [*head[:-1], f"{head[-1]:{COLUMN}}{body[0][COLUMN:]}", *body[1:]]
     return [*head, *body]

@@ -13,6 +13,7 @@ from dln_jax.files import write_figure, write_json
 from dln_jax.learning.engine.problem import Training
 from dln_jax.metrics.latency import Latency
 from dln_jax.metrics.verdict import Verdict
+from dln_jax.runs.devices import print_compilation
 from dln_jax.runs.folder import write_config
 
 
@@ -45,7 +46,7 @@ def png(draw: Callable[..., Figure], *arguments: Any, **options: Any) -> Callabl
 
 
 def finish(folder: Path, options: Any, report: Report) -> None:
-    """Stores and prints a report, then draws its figures unless the options decline them.
+    """Stores and prints a report, and draws its figures unless the options decline them; the verdict comes last.
 
     Raises:
         InputError: a training that failed.
@@ -57,21 +58,21 @@ def finish(folder: Path, options: Any, report: Report) -> None:
     write_config(folder, options, **report.chosen, **stored)
     if report.rows:
         print_numbers(report.rows, title=report.title, columns=report.columns)
-    for text in (*report.lines, f"run folder: {folder}"):
-        print(text)
-    refused = verdict is not None and verdict.level == "refused"
-    if verdict is not None:
-        print(verdict.line)
-    if refused and report.ended_by_user:
-        print(
-            "warning: refused, but training ended at your own limit (--steps, --iterations or --seconds), so the exit "
-            "status is 0; train longer before you use this model"
-        )
     if getattr(options, "figures", False):
         for name, draw in report.figures.items():
             draw(folder / name)
+    print_compilation()
+    print(f"run folder: {folder}", *report.lines, sep="\n")
+    refused = verdict is not None and verdict.level == "refused"
+    if refused and report.ended_by_user:
+        print(
+            "warning: the model is refused, but the exit status is 0, because --steps, --iterations or --seconds ended "
+            "the training; train longer before you use this model"
+        )
+    if verdict is not None:
+        print(verdict.line)
     if report.error:
-        raise InputError(report.error)
+        raise InputError(f"{folder}: {report.error}")
     if refused and not report.ended_by_user:
         raise FitRefused(verdict)
 
@@ -84,30 +85,49 @@ def print_numbers(
     width: int | None = None,
 ) -> None:
     """Prints a table of quantities, their values and units, `width` columns wide (default: the terminal's)."""
-    justify = {"quantity": "left", "joint": "left", "unit": "left", "status": "left"}
-    table = Table(*(Column(column, justify=justify.get(column, "right")) for column in columns), title=title)  # type: ignore
+    left = ("quantity", "joint", "motion", "unit", "status")
+    table = Table(*(Column(column, justify="left" if column in left else "right") for column in columns), title=title)
     for row in rows:
         table.add_row(*row)
     Console(highlight=False, soft_wrap=True, width=width).print(table)
 
 
-def unit_of(metric: str, units: Mapping[str, str]) -> str:
-    """Unit of a metric: from `units`, or of a time by its suffix; empty otherwise."""
-    return units.get(metric, "s" if metric.endswith("_seconds") else "µs" if metric.endswith("_us") else "")
+LABELS = {
+    "train_seconds": "training time",
+    "compile_seconds": "compilation time",
+    "one_step_p50_us": "latency of one call, median",
+    "one_step_p99_us": "latency of one call, 99th percentile",
+    "_seconds": " time",
+    "_median": ", median",
+    "mse": "MSE",
+    "_": " ",
+}
+"""Words for parts of metrics' names."""
 
 
-def number(metric: str, value: int | float) -> str:
-    """Formats a metric for a table."""
-    if isinstance(value, int):
-        return f"{value:,}"
-    if any(word in metric for word in ("_mse", "_nmse", "_loss", "spread", "error", "eigenvalue", "condition")):
-        return f"{value:.2e}"
-    return f"{value:,.2f}" if "share" in metric or metric.startswith("vpt") else f"{value:,.1f}"
+def spaced(name: str, labels: Mapping[str, str] = {}) -> str:
+    """The name of a metric or an option in words: those of `labels` for parts of it, then those of `LABELS`."""
+    for part, words in {**labels, **LABELS}.items():
+        name = name.replace(part, words)
+    return name
 
 
-def rows_of(metrics: Mapping[str, float | int]) -> list[tuple[str, str, str]]:
-    """Rows of the printed table for metrics whose names say what they are, with the unit of times."""
-    return [(key.replace("_", " "), f"{value:.4g}", "s" if "seconds" in key else "") for key, value in metrics.items()]
+def rows_of(
+    metrics: Mapping[str, float | int], labels: Mapping[str, str] = {}, units: Mapping[str, str] = {}
+) -> list[tuple[str, str, str]]:
+    """Rows of the printed table: label, value and unit of every metric but the verdict, which is printed in words.
+
+    Args:
+        labels: as for `spaced`.
+        units: units by a part of the name; the first that occurs counts, and times have one of their own.
+    """
+    rows = []
+    for name, value in metrics.items():
+        unit = next(unit for part, unit in {**units, "_seconds": "s", "_us": "µs", "": ""}.items() if part in name)
+        if name != "verdict":
+            whole = float(value).is_integer() and abs(value) < 1e9
+            rows.append((spaced(name, labels), f"{value:,.0f}" if whole else f"{value:.4g}", unit))
+    return rows
 
 
 def one_step_metrics(latency: Latency) -> dict[str, float]:

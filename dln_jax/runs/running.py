@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dln_jax.errors import FitRefused, InputError, ProcessLost, require_magnitude, require_within
-from dln_jax.options import CompilationCache, NoCompilationCache, Scaled
+from dln_jax.options import CompilationCache, Folder, NoCompilationCache, Scaled
 from dln_jax.process import counting_from
 from dln_jax.runs.arguments import parse
 
@@ -19,8 +19,6 @@ MOST_CHARACTERS = 400
 """Characters shown at either end of a long message; the middle is left out."""
 INTERRUPTED = 130
 """Exit status after an interrupt, as shells have it."""
-LARGEST_SEED = 2**32 - 1
-"""Largest seed of NumPy and JAX."""
 
 
 def run(
@@ -54,25 +52,33 @@ def run(
             sys.stdout.flush()  # the help; raises BrokenPipeError here if its reader has closed the pipe
         require_possible(own)
         # JAX takes a second to import, which the help and a mistake do not need.
+        import jax
+
         from dln_jax.runs import devices
-        from dln_jax.runs.folder import with_stored_arguments
+        from dln_jax.runs.folder import require_free, with_stored_arguments
+        from dln_jax.runs.progress import heartbeat
         from dln_jax.scale import losses_named
 
         # Data and references are float64; models state their own precision.
-        devices.enable_double_precision()
+        jax.config.update("jax_enable_x64", True)
         member = devices.membership_in(own) if isinstance(own, Scaled) else None
-        options = with_stored_arguments(own, arguments) if getattr(own, "resume", False) else own
-        before = devices.compilation().copy() if from_shell else None
-        unkept = devices.keep_programs(shared.compilation_cache) if from_shell else ""
+        if getattr(own, "resume", False):
+            options = with_stored_arguments(own, arguments)
+        else:
+            options = own
+            if isinstance(own, Folder) and own.out is not None:
+                require_free(own.out, hasattr(own, "resume"))  # before data are read
+        if from_shell:
+            devices.compilation()["unkept"] = devices.keep_programs(shared.compilation_cache)
 
     start = began if began is not None else time.perf_counter()
 
     def work(options: Any) -> None:
-        lost = contextlib.nullcontext() if member is None else losses_named(devices.remedy_of(options))
-        with as_one_line(prog, options), lost, counting_from(start):
+        nothing = contextlib.nullcontext()
+        lost = nothing if member is None else losses_named(devices.remedy_of(options))
+        with as_one_line(prog, options), lost, counting_from(start), heartbeat(start) if from_shell else nothing:
             main(options)
-            if before and (text := devices.compilation_summary(before, unkept)):
-                print(text)
+            devices.print_compilation()
             sys.stdout.flush()
 
     if member is not None:
@@ -105,7 +111,7 @@ def as_one_line(prog: str, options: Any) -> Iterator[None]:
     except InputError as error:
         raise _refusal(str(error)) from None
     except MemoryError as error:
-        raise _refusal(f"out of memory ({error or 'no more can be had'}); ask for less") from None
+        raise _refusal(f"out of memory ({error or 'no more is available'}); ask for less") from None
     except (RuntimeError, AssertionError) as error:
         if "RESOURCE_EXHAUSTED" in str(error):
             raise _refusal(f"out of memory ({str(error).splitlines()[0]:.200}); ask for less") from None
@@ -155,6 +161,8 @@ def interrupted(command: str, options: Any, folder: Path | None = None) -> str:
 
 def require_possible(options: Any) -> None:
     """Raises `InputError` for an option that is not finite or is implausibly large."""
+    from dln_jax.types import require_seed  # imports JAX
+
     counts = {}
     for name, value in dataclasses.asdict(options).items():
         option = f"--{name.replace('_', '-')}"
@@ -163,8 +171,7 @@ def require_possible(options: Any) -> None:
                 raise InputError(f"{option} is {value}; expected a finite number, or leave it out")
             require_magnitude(option, value)
         elif isinstance(value, int) and name == "seed":
-            if not 0 <= value <= LARGEST_SEED:
-                raise InputError(f"seed is {value}; expected whole numbers from 0 to {LARGEST_SEED}")
+            require_seed(value, getattr(options, "seeds", 1))
         elif isinstance(value, int):
             counts[option] = value
     require_within(counts)

@@ -13,9 +13,7 @@ from dln_jax.learning.kinematics.fit import TreeFit
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees.recursions import tree_system
-from dln_jax.metrics.errors import (
-    definiteness,
-)
+from dln_jax.metrics.errors import definiteness
 from dln_jax.metrics.motions import Motion
 from dln_jax.metrics.verdict import FAR_FROM_NOISE, HeldOut, Verdict, held_out, judge, verdict_metrics, worst
 from dln_jax.precision import quick_compilation
@@ -110,16 +108,14 @@ def verdict_on_search(search: TreeFit, errors: HeldOut) -> tuple[Verdict | None,
         if above <= AT_NOISE:
             return None, numbers
     if agreeing < search.agreement:
-        reason = f"only {agreeing} of {count} descents reached the lowest loss, so a lower one may exist"
+        reason = f"only {agreeing} of {count} starts reached the lowest loss; a lower loss may exist"
         remedy = "try another --seed, more --seconds or a --kinematic-prior of the arm"
     elif twin is not None and not twin.same:
-        reason = f"two descents to the same loss found {twin.words}, so the motions do not determine the axes"
+        reason = f"two starts with the same loss {twin.words}; the motions do not determine the axes"
         remedy = "record more and different motions, or add a --kinematic-prior"
     elif above is not None and above > FAR_FROM_NOISE:
-        reason = f"held-out errors are {above:.2g} times the noise, though {agreeing} descents agree"
-        remedy = (
-            "record more and different motions, or add a --kinematic-prior; friction that the tree lacks looks the same"
-        )
+        reason = f"held-out errors are {above:.2g} times the noise, although {agreeing} starts agree"
+        remedy = "record more and different motions, or add a --kinematic-prior; missing friction has the same effect"
     else:
         return None, numbers
     return Verdict("doubtful", reason, remedy), numbers

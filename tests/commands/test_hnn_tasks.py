@@ -79,14 +79,14 @@ def test_own_positions_train_and_resume_to_the_same_model(positions, capsys):
 def test_what_a_task_does_not_take_is_one_line(positions, capsys):
     rows = [
         ("--task juggling", "task 'juggling' is unknown"),
-        ("--task measured", "needs its data"),
+        ("--task measured", "give it with --data"),
         ("--task measured --data forced.npz", "applied forces"),
         ("--task measured --data marked.npz", "q has numbers of up to 1.0e+308"),
         ("--task measured --data points.npz", "no trajectory has two samples"),
         ("--task spring --data positions.npz", "--data is an option of --task measured"),
         ("--task spring --test a", "--test is an option of --task measured"),
         ("--task spring", *SLIDING, "--needs is an option of --task measured"),
-        ("--task spring --model trigonometric", "is of no phase space"),
+        ("--task spring --model trigonometric", "has no phase space"),
         (OWN, "--needs", '{"joints": ["revolute", "revolute"]}', "has 2 joints"),
         (OWN, "--noise small", "--noise is 'small'"),
         (OWN, "--noise 0", "finite positive numbers"),
@@ -115,6 +115,6 @@ def test_out_of_time_the_fit_of_rates_is_the_result(positions, capsys):
     """In a folder like any other."""
     options = "--optimizer adam --steps 2 --no-figures --seconds 1e-6 --out hurried"
     command(train_hnn_task, OWN, *SLIDING, options)
-    assert "out of time after the fit of rates: motions were not fitted" in capsys.readouterr().out
+    assert "time was up after the fit to rates; motions were not fitted" in capsys.readouterr().out
     assert np.isfinite(json_of(positions / "hurried/metrics.json")["validation_error"])
     assert isinstance(load("hurried").flow, Flow)

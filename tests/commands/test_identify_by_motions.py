@@ -74,8 +74,8 @@ def test_motions_identify_the_pendulum_and_predict_longer(place, capsys):
     for by, options in (("motions", "--out motions"), ("both", "--window 0.3 --out both")):
         command(identify, log, options, "--by", by)
         said = capsys.readouterr().out
-        assert ("chosen by inner splits of the training data: windows of" in said) == (by == "motions")
-        assert f"by {by}: windows are off" in said and "verdict: good" in said
+        assert ("chosen by cross-validation in the training data: windows of" in said) == (by == "motions")
+        assert f"fit to {by}: rms residual" in said and "verdict: good" in said
         numbers[by] = json_of(place / by / "metrics.json")
         assert numbers[by]["vpt_seconds"] >= numbers[by]["by_torques_vpt_seconds"]
         parameters = json_of(place / by / "parameters.json")["parameters"]

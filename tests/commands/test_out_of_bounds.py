@@ -170,11 +170,11 @@ def test_a_run_is_resumed_where_its_data_have_moved(here, monkeypatch, data):
     Path("run").symlink_to("moved/run")
     assert resumed() == Path("log")
     monkeypatch.chdir("moved")
-    with one_line("log, which is not here; give its new path by --data"):
+    with one_line("log, which does not exist; give its new path with --data"):
         resumed()
     assert resumed(data=Path("../log")) == Path("../log")
     file.write_bytes(b"stated")
-    with one_line("started with other data than .*log has now"):
+    with one_line("data in .*log have changed"):
         resumed(data=Path("../log"))
 
 

@@ -70,7 +70,7 @@ def test_own_orbits_axis_by_axis_need_no_motions(files, capsys):
     """Nothing is stated: order, bodies and model are found, and rates of other starts are exact."""
     command(train_hnn_task, TASK, "orbits.npz", "--out orbits --steps 25")
     out = capsys.readouterr().out
-    assert "auto: pairwise-hnn" in out and "motions need no fit" in out and "motions: loss" not in out
+    assert "auto: pairwise-hnn" in out and "no fit to motions is needed" in out and "motions: loss" not in out
     run = load(files / "orbits")
     assert (run.description["order"], run.description["dimension"], run.description["alike"]) == ("axes", 2, True)
     system = PUBLISHED["two-body"]

@@ -117,7 +117,7 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys, rod):
         "--positions free,free": "2 ranges; the plant has 1 joints",
         "--positions -1:1": "is outside",
         "--weights 1": "expected 2 positive numbers",
-        "--robust 1.5": "robust is 1.5",
+        "--robust 1.5": "--robust is 1.5",
         "--run /nowhere": "no such file",
     }
     assert_refused(capsys, train_value, rows.items(), "--plant", rod, out=tmp_path / "run")

@@ -83,7 +83,7 @@ def test_a_law_that_does_not_carry_over_to_the_plant_is_refused_with_the_reason(
     monkeypatch.setattr(f"{PLACE}.try_plant", lambda *_, **__: (few, []))
     assert exit_status(swing_up, "--plant", two_links(tmp_path), MOTOR, "--starts 3 --out", tmp_path / "run") == 1
     said = capsys.readouterr().out
-    assert "verdict: refused: 33.3% of 3 starts up" in said
+    assert "verdict: refused: 33.3% of 3 starts are up" in said
     assert "1 of 3 were stopped; the first: 'elbow' moves at 31/s" in said
 
 

@@ -42,7 +42,7 @@ def chosen(folder, **more):
 def test_the_tree_of_a_robot_is_kept_where_it_explains_all_but_the_noise(workplace, capsys):
     fit = chosen(workplace)
     stored = json_of(workplace / "selection.json")
-    assert stored["kept"] == fit.name == "rigid-tree" and "are the noise" in stored["ended"]
+    assert stored["kept"] == fit.name == "rigid-tree" and "torque noise" in stored["ended"]
     assert len(stored["candidates"]) == 1
     found = fit.dynamics.inverse_dynamics
     true = dynamics(tree_system(ARM, joint_dissipation(*FRICTION.values()))).inverse_dynamics

@@ -14,7 +14,7 @@ from planar_arm import motions
 from small_logs import small_log
 
 from dln_jax import load
-from dln_jax.commands import make_data, train_delan
+from dln_jax.commands import export_c, make_data, train_delan
 from dln_jax.data import schema
 
 ROOT = Path(__file__).parents[3]
@@ -58,7 +58,7 @@ def test_a_run_writes_all_its_files(trained):
 def test_a_finished_run_is_never_overwritten_and_resumes_to_itself(trained, folder, capsys):
     before = {path: path.read_bytes() for path in trained.iterdir()}
     for options, words in (
-        ((TINY, "--out", trained), "already contains a run"),
+        ((TINY, "--data none.npz", "--out", trained), "already contains a run"),
         (("--resume --width 5", "--out", trained), "started with width = 4"),
         (("--resume", "--out", folder / "void"), "holds none"),
         (("--resume",), "holds none"),
@@ -96,7 +96,7 @@ def test_a_loss_that_explodes_keeps_the_last_good_model(folder, capsys):
 def test_out_of_time_is_a_run_that_has_learned_and_can_go_on_with_more(folder, capsys):
     options = f"--optimizer adam --width 3 --depth 1 {BRIEF} --scene pendulum --steps 400 --seconds 1e-6"
     command(train_delan, options, "--out late")
-    assert "out of time at step" in capsys.readouterr().out
+    assert "time is up at step" in capsys.readouterr().out
     early = json_of(folder / "late/metrics.json")
     assert 0 < early["best_step"] == early["steps"] < 400
     command(train_delan, "--out late --resume --seconds 2e-6", BRIEF)
@@ -173,11 +173,18 @@ def test_a_bare_recording_of_an_arm_with_friction_is_fitted_exactly_by_default(f
     said = capsys.readouterr().out
     assert "one recording: cut into blocks of time, 8 for training, 1 for validation, 1 for the test" in said
     assert "friction of joints: viscous, coulomb, offset" in said
-    assert "verdict: good" in said and "trigonometric is exact" in said
+    assert said.splitlines()[-1].startswith("verdict: good") and "Stopped: trigonometric is exact." in said
     metrics, stored = (json_of(folder / f"bare/{name}.json") for name in ("metrics", "selection"))
     assert metrics["torque_mse"] < 1e-18 and metrics["verdict"] == 0 and metrics["validation_nmse"] < 1e-18
     assert stored["kept"] == "trigonometric" == load("bare").description["name"]
     assert stored["ended"] == "trigonometric is exact"
+
+
+def test_exports_are_numbered_beside_their_run(trained, capsys):
+    for _ in range(2):
+        command(export_c, "--run", trained, "--functions energy")
+    out = trained.with_name(f"{trained.name}-c-2")
+    assert "already contains an export" in refused(capsys, export_c, "--run", trained, "--out", out)
 
 
 def test_a_model_that_is_worse_than_a_constant_is_refused_in_words(folder, capsys):

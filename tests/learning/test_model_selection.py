@@ -66,7 +66,7 @@ def test_the_search_ends_at_the_noise_and_not_where_that_is_overestimated():
 def test_out_of_time_the_first_that_can_be_fitted_is_kept():
     candidates = {"refused": lambda: "too large", "first": candidate(1, 1), "second": candidate(1, 1)}
     kept, rows, ended = compared(candidates=candidates, until=0.0)
-    assert kept == "first" and ended == "time is out; not tried: second" and len(rows) == 2
+    assert kept == "first" and ended == "time is up after 0 s; second not tried" and len(rows) == 2
 
 
 def test_what_cannot_be_fitted_is_refused():

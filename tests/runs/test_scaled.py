@@ -24,7 +24,7 @@ def test_mistakes_are_one_line(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     jax.devices()
     for options, message in {
-        TOGETHER: "by --out",
+        TOGETHER: "need --out",
         "--processes 2": "--coordinator and --process-id missing",
         "--processes 0": "expected a positive whole number",
         "--devices 0": "--devices is 0",

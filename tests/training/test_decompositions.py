@@ -64,7 +64,7 @@ def test_weight_of_a_slide_is_its_gravity_and_no_offset_of_friction(workplace, c
 def test_dry_friction_of_a_slide_that_moves_one_way_is_known_only_with_its_weight(workplace, capsys):
     metrics = slid(workplace, 3.0)
     assert metrics["torque_mse"] < 1e-16 and metrics["gravity_determined"] == 0
-    assert "gravity and friction of joints [1] are known only in sum" in capsys.readouterr().out
+    assert "gravity and friction of joints [1] are known only as a sum" in capsys.readouterr().out
 
 
 def test_friction_beside_the_potential_of_a_network_has_no_offset(workplace):

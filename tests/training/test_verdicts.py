@@ -13,10 +13,10 @@ def test_learned_tree_says_how_its_frames_were_found():
     for agreeing, error, noise, said in [
         (5, 1e-4, 1e-4, ""),
         (1, 1e-4, 1e-4, ""),  # at the noise there is nothing lower
-        (1, 3e-4, 1e-4, "only 1 of 31 descents reached the lowest loss"),
-        (1, 3e-4, None, "only 1 of 31 descents"),
+        (1, 3e-4, 1e-4, "only 1 of 31 starts reached the lowest loss"),
+        (1, 3e-4, None, "only 1 of 31 starts"),
         (5, 3e-4, 1e-4, ""),
-        (5, 5e-4, 1e-4, "held-out errors are 5 times the noise, though 5 descents agree"),
+        (5, 5e-4, 1e-4, "held-out errors are 5 times the noise, although 5 starts agree"),
         (5, 5e-4, None, ""),
     ]:
         known = None if noise is None else np.full(2, noise)
@@ -53,7 +53,7 @@ def test_friction_that_drives_is_refused_and_a_fast_scale_doubted():
         (qd * [1.0, -1.8], 0.1, "refused"),
     ):
         verdict = friction_verdict(("hip", "knee"), qd, tau, friction, np.array([0.1, scale]))
-        assert verdict.level == level and ("friction of knee drives it" in verdict.reason) == (level == "refused")
+        assert verdict.level == level and ("friction of knee adds energy" in verdict.reason) == (level == "refused")
 
 
 def test_spikes_are_single_samples_and_dry_friction_has_none():

@@ -140,7 +140,7 @@ def choose_window(
     names = {window: "torques" if window is None else f"{window:g} s" for window in means}
     shown = ", ".join(f"{names[window]} {mean:.3g} s" for window, mean in means.items())
     kept = "parameters by torques" if best is None else f"windows of {names[best]}"
-    return best, f"chosen by inner splits of the training data: {kept} (prediction times: {shown}){reason}"
+    return best, f"chosen by cross-validation in the training data: {kept} (prediction times: {shown}){reason}"
 
 
 def spread_of(*data: Trajectories) -> Float[np.ndarray, " d"]:
@@ -173,14 +173,18 @@ def prediction_times(
 def motion_lines(by: str, fit: MotionFit | None, times: dict[str, float | int]) -> list[str]:
     """Lines on the fit to motions, if there is one, and on predictions of held-out motions."""
     line = (
-        f"held-out motions: predicted for {times['vpt_seconds']:.3g} s of {times['predicted_seconds']:.3g} s, by "
-        f"torques alone for {times['by_torques_vpt_seconds']:.3g} s (mean valid prediction time)"
+        f"held-out motions: mean valid prediction time {times['vpt_seconds']:.3g} s of "
+        f"{times['predicted_seconds']:.3g} s (fitted to torques alone: {times['by_torques_vpt_seconds']:.3g} s)"
     )
     if fit is None:
         return [line]
     lines = [
-        f"by {by}: windows are off by {fit.after:.3g} of their noise (before: {fit.before:.3g}; {fit.rounds} rounds)",
+        f"fit to {by}: rms residual over noise {fit.after:.3g}, before {fit.before:.3g} ({fit.rounds} rounds)",
         line,
         f"motions follow the logged torques by {1e3 * fit.delay:.1f} ms; the model has no delay",
     ]
-    return lines if fit.converged else [*lines, "the fit to motions did not converge; record motions closer to the use"]
+    return (
+        lines
+        if fit.converged
+        else [*lines, "the fit to motions did not converge; record motions closer to the application"]
+    )

@@ -94,7 +94,7 @@ def run(options: Arguments) -> None:
         print(f"{options.robot.name}: {len(names)} joints, {', '.join(names)}")
         print(f"{options.data.name}: {len(train.t)} samples fitted, {len(test.t)} held out ({kind})")
         if train.joint_names is None:
-            print("the data name no joints: taken to be in this order (key joint_names)")
+            print("the data have no joint_names; joints are assumed to be in this order")
         for line in (*log.remarks, *parts.remarks):
             print(line)
         if options.lock:
@@ -194,7 +194,7 @@ def run(options: Arguments) -> None:
             try:
                 inner = Parts(Split(*inner_split(train), test))
             except InputError:
-                print("no uncertainty is stored: two trajectories or blocks to fit are the least that it takes")
+                print("no uncertainty is stored: it takes at least two trajectories or blocks to fit")
             else:
                 fit = with_uncertainty(fit, inner, log.torque, print, unit=solution.fit.noise)
                 fit.save(folder)
@@ -217,7 +217,7 @@ def run(options: Arguments) -> None:
         report = Report(
             metrics,
             rows,
-            "held out: nMSE by parameters, rms error, and noise of the fit",
+            "held-out nMSE by parameters, rms error, and noise of the fit",
             columns=("joint", *(name.replace("_", " ") for name in predicted), "rms", "noise", "unit"),
             verdict=verdict,
             figures=figures,
@@ -229,7 +229,7 @@ def run(options: Arguments) -> None:
                 *of_terms,
                 *findings(solution, train, names),
                 of_file,
-                "every parameter: report.txt",
+                "report.txt lists all parameters",
             ),
         )
         finish(folder, options, report)
@@ -315,5 +315,5 @@ def write_identified(
         )
     except InputError as error:
         return f"no {path.name}: {error}"
-    lacks = " without armature, which URDF cannot state (a comment in the file has it)" * (path.suffix == ".urdf")
+    lacks = "; armature is in a comment, because URDF cannot state it" * (path.suffix == ".urdf")
     return f"{path.name}: the robot's file with these values{lacks}"

@@ -96,7 +96,7 @@ def judge_robot(
             rows = ";".join(",".join(f"{entry:g}" for entry in row) for row in S)
             remedy = (
                 f"friction of a motor that turns with {names[joint]} and {ratio:g} times {names[other]} would explain "
-                f"{explained:.0%} of what is left in both: try --motors '{rows}'"
+                f"{explained:.0%} of the residual of both: try --motors '{rows}'"
             )
             verdict = verdict._replace(remedy=f"{remedy}; else {verdict.remedy}")
     share = spikes(train.tau).mean(axis=0)
@@ -124,7 +124,7 @@ def consistent_verdict(solution: Identification, fitted: np.ndarray, free: np.nd
     if solution.consistent is None or mine <= 2 * least + WORSE:
         return Verdict("good", "")
     level = "refused" if mine > least + IMPOSSIBLE else "doubtful"
-    reason = f"physically consistent bodies have an nMSE of {mine:.3g}, least squares without that bound {least:.3g}"
+    reason = f"physically consistent parameters have an nMSE of {mine:.3g}, unconstrained least squares {least:.3g}"
     if not solution.consistent.converged:
         reason += f", not converged after {solution.consistent.iterations} iterations"
     remedy = "check the signs and units of tau and the robot's file: no robot has such torques"
@@ -142,7 +142,7 @@ def friction_verdict(
     every, counts = [Verdict("good", "")], np.std(friction, axis=0) > COUNTS * np.std(tau, axis=0)
     power = np.mean(qd * (friction - friction.mean(axis=0)), axis=0)
     for k in np.flatnonzero(counts & (power < 0)):
-        reason = f"friction of {names[k]} drives it: {-power[k]:.3g} W on average"
+        reason = f"friction of {names[k]} adds energy, {-power[k]:.3g} W on average"
         every.append(Verdict("refused", reason, "check the signs of tau and qd"))
     if scales is not None:
         for k in np.flatnonzero(counts & (scales > np.quantile(np.abs(qd), FAST, axis=0))):
@@ -165,8 +165,8 @@ def weight_verdict(mine: Float[np.ndarray, "N d"], file: Float[np.ndarray, "N d"
     if typical <= HEAVIER and off[joint] <= MUCH_HEAVIER:
         return Verdict("good", "")
     reason = (
-        f"the bodies take {factor:.3g} times the torques of those in the robot's file, in joint {joint + 1} "
-        f"{factors[joint]:.3g} times"
+        f"the identified bodies take {factor:.3g} times the torques of those in the robot's file, and in joint "
+        f"{joint + 1} {factors[joint]:.3g} times"
     )
     remedy = "check the unit of tau (N m) and its side of the gears, or correct the masses in the file"
     return Verdict("refused" if typical > MUCH_HEAVIER else "doubtful", reason, remedy)

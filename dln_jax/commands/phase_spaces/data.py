@@ -193,7 +193,7 @@ def read_motions(
     """
     task = TASKS[name]
     if path is None:
-        raise InputError(f"task '{name}' needs its data, which are not part of this project: give their file")
+        raise InputError(f"task '{name}' needs a file of measured motions; give it with --data")
     known = {"needs": needs, "assume": assumed_needs}
     if task.needs is not None:
         known = {"needs": task.needs, "needs_origin": f"task '{name}'"}

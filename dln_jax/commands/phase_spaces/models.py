@@ -66,7 +66,7 @@ def description_of(log: PhaseLog, model: str, *, order: Order | None = None, **s
     own = log.noise is not None and name in IN_VELOCITIES
     if not own and not entry_of(name).properties.canonical:
         known = ", ".join(name for name, entry in CATALOGUE.items() if entry.properties.canonical)
-        raise InputError(f"model '{name}' is of no phase space; choose from auto, {known}")
+        raise InputError(f"model '{name}' has no phase space; choose from auto, {known}")
     values: dict[str, Any] = {}
     if name not in (POLYNOMIAL, *LINEAR):
         width, depth = (task.width, task.depth) if name == task.suits else (task.network, task.network_depth)
@@ -119,7 +119,7 @@ def choose_model(
     if len(descriptions) == 1:
         if has_biased_rates(log):
             context.say(
-                f"auto: {names[0]}; the states are noisy, so that errors of rates cannot rank models: "
+                f"auto: {names[0]}; the states are noisy, so errors of rates cannot rank models: "
                 f"try --model {POLYNOMIAL} as well"
             )
         return descriptions[0]
@@ -143,7 +143,7 @@ def choose_model(
     )
     left = "; ".join(names[len(trials) :])
     title = "candidates, by errors of rates on validation motions"
-    say_selection(context, title, names[chosen.candidate], left and f"left out are {left}", rows)
+    say_selection(context, title, names[chosen.candidate], left and f"{left} not tried", rows)
     return chosen.outcome
 
 

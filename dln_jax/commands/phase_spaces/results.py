@@ -18,7 +18,7 @@ from dln_jax.metrics.latency import one_step
 from dln_jax.metrics.phase_space import Motions, energies, field_errors, field_rates, motion_errors, predict
 from dln_jax.metrics.predictions import on_grid, padded, predict_measured, prediction_metrics
 from dln_jax.metrics.verdict import judge_motions, quarter_period
-from dln_jax.runs.report import Report, one_step_metrics, png, unit_of
+from dln_jax.runs.report import Report, one_step_metrics, png, rows_of
 from dln_jax.zoo.run import Run
 
 SUBSTEPS = 4
@@ -29,30 +29,31 @@ LOSSES = {
     MOTIONS: "motions: mean square error of (q, p) over its weight",
 }
 """Label of the loss of every stage."""
-RATE_UNITS = "units of qd² and pd²"
-OVER_STARTS = {"": "", "_standard_error": ": its standard error over starts", "_median": ": its median over starts"}
-METRICS = {
-    **{
-        f"{name}{ending}": (f"{label}, mean square error{words}", unit)
-        for name, label, unit in (
-            ("energy_mse", "energy along predicted motions", "J²"),
-            ("published_energy_mse", "published energy along predicted motions", "units of that energy²"),
-            ("rollout_mse", "(q, p) of predicted motions", "units of q² and p²"),
-        )
-        for ending, words in OVER_STARTS.items()
-    },
-    "vpt_seconds": ("time of correct prediction of motions", "s"),
-    "vpt_median_seconds": ("time of correct prediction of motions: its median", "s"),
-    "predicted_seconds": ("duration of the predicted motions", "s"),
-    "vpt_lyapunov": ("time of correct prediction of motions, in Lyapunov times of the model", "1"),
-    "lyapunov_seconds": ("Lyapunov time of the model", "s"),
-    "energy_drift": ("energy error along predicted motions, over the largest kinetic energy", "1"),
-    "train_loss": ("(qd, pd) at training states, mean square error", RATE_UNITS),
-    "test_loss": ("(qd, pd) at test states, mean square error", RATE_UNITS),
-    "clean_field_mse": ("(qd, pd) against the exact field, mean square error", RATE_UNITS),
-    "validation_error": ("validation loss of the last stage", "see training.png"),
+LABELS = {
+    "energy_mse": "energy MSE of predicted motions",
+    "rollout_mse": "(q, p) MSE of predicted motions",
+    "vpt_seconds": "valid prediction time, mean",
+    "vpt_median_seconds": "valid prediction time, median",
+    "vpt_lyapunov": "valid prediction time, in Lyapunov times of the model",
+    "predicted_seconds": "length of the predicted motions",
+    "lyapunov_seconds": "Lyapunov time of the model",
+    "energy_drift": "energy error of predicted motions over the largest kinetic energy",
+    "train_loss": "(qd, pd) MSE at training states",
+    "test_loss": "(qd, pd) MSE at test states",
+    "clean_field_mse": "(qd, pd) MSE against the exact field",
+    "validation_error": "validation loss of the last stage",
+    "_standard_error": ", standard error over starts",
+    "_median": ", median over starts",
 }
-"""Label and unit of a metric by its name; other names say them. The true plant has an energy error of 0."""
+"""Words for parts of metrics' names. The true plant has an energy error of 0."""
+UNITS_OF_METRICS = {
+    "published_energy_mse": "units of that energy²",
+    "energy_mse": "J²",
+    "rollout_mse": "units of q² and p²",
+    "_loss": "units of qd² and pd²",
+    "clean_field_mse": "units of qd² and pd²",
+    "validation_error": "as in training.png",
+}
 UNITS = {"revolute": ("rad", "kg m²/s"), "prismatic": ("m", "kg m/s")}
 """Units of q and p."""
 
@@ -86,14 +87,10 @@ def evaluate(log: PhaseLog, fit: PhaseFit) -> Report:
         metrics |= {f"q{joint}_noise": float(sd) for joint, sd in enumerate(np.ravel(log.noise.q), start=1)}
     metrics["validation_error"] = float(fit.training.validation)
     metrics = {key: value for key, value in metrics.items() if np.isfinite(value)}
-    rows = []
-    for key, value in metrics.items():
-        label, unit = METRICS.get(key, (key.replace("_", " "), unit_of(key, {})))
-        rows.append((label, f"{value:.4g}", unit))
     failed = fit.stop == "not finite"
     return Report(
         metrics=metrics | {"verdict": verdict.number},
-        rows=rows,
+        rows=rows_of(metrics, LABELS, UNITS_OF_METRICS),
         title=f"test motions of {log.name}, f64",
         verdict=verdict,
         figures=figures_of(log, fit, predicted[0], rates),

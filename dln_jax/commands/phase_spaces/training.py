@@ -191,13 +191,16 @@ def train(
         measured = {"qd", "qdd" if velocities else "pd"}.isdisjoint(log.fitted.estimated) and log.weights is not None
         negligible = EXACT * mean_square_rates(log, description, parts[1])
         if measured and (log.free_of_noise or first.validation <= negligible):
-            stop, remark = "exact", "the measured rates are free of noise or fitted exactly: motions need no fit"
+            stop, remark = (
+                "exact",
+                "the measured rates are free of noise or fitted exactly, so no fit to motions is needed",
+            )
         elif stop == "time" or left <= MOTIONS_COMPILE * (first.compile_seconds or first.train_seconds):
-            stop, remark = "time", "out of time after the fit of rates: motions were not fitted"
+            stop, remark = "time", "time was up after the fit to rates; motions were not fitted"
         else:
             if context.folder is not None:
                 save(context.folder, description, first.parameters)
-                context.say(f"{context.folder} holds the model of the fit of rates; the fit of motions begins")
+                context.say(f"{context.folder} holds the model fitted to rates; the fit to motions begins")
             problem = problem_of_motions(log, description, parts, first.parameters, seed)
             stage, last = MOTIONS, fit_stage(MOTIONS, problem, task.trajectory_steps, False)
             stop = last.stop.reason
@@ -205,13 +208,16 @@ def train(
                 last = last._replace(parameters=last.parameters["model"])
             if last.stop.step and np.isfinite(last.validation):
                 done[MOTIONS] = last
-    at = f"after step {last.stop.step} of the fit of {stage}"
+    at = f"after step {last.stop.step} of the fit to {stage}"
     if stop == "time" and not remark:
-        remark = f"out of time {at}: kept is the best so far"
+        remark = f"time was up {at}; the best parameters so far are kept"
     if stop == "not finite":
-        remedy = "state the plant's --needs, try another --model"
-        remedy = "lower --learning-rate" if isinstance(optimiser, Adam) else remedy
-        remark = f"the loss stopped being finite {at}; {remedy}, or look for very large numbers in the data"
+        adam = isinstance(optimiser, Adam)
+        remedy = "lower --learning-rate" if adam else "state the plant's --needs, try another --model"
+        remark = (
+            f"the loss stopped being finite {at}; the last good model is kept; {remedy}, or check the data for huge "
+            "numbers"
+        )
     training = done.get(MOTIONS, first)
     if not np.isfinite(training.validation):
         raise InputError(remark or "no validation error is finite; look for very large numbers in the data")

@@ -126,11 +126,12 @@ def results(scene: str, mesh: Mesh, motion: SimulatedMotion) -> list[Row]:
 
 
 LABELS = {
-    "worst_residual_m_per_s2": "worst residual",
-    "smallest_volume_ratio": "smallest J = volume / rest volume",
-    "energy_created_J": "energy created by the time step (damped where negative)",
+    "newton_iterations_m": "Newton iterations, m",
+    "worst_residual_m_per_s2": "largest residual",
+    "smallest_volume_ratio": "smallest volume ratio J",
+    "energy_created_J": "energy created by the time step (negative: damped)",
 }
-"""Labels of quantities that are not self-explanatory."""
+"""Words for parts of the quantities' names."""
 
 
 def warnings(motion: SimulatedMotion) -> list[str]:

@@ -1,7 +1,6 @@
 """Scenes of `simulate` from options: an example and its stepper, with a user's own mesh and loads on its named sets."""
 
 import inspect
-import math
 from typing import Any, NamedTuple
 
 import jax
@@ -58,14 +57,12 @@ def prepare(options: Arguments, name: str) -> PreparedScene:
     names = ("cells", "dimension", "youngs_modulus", "poisson_ratio", "order", "mesh")
     choices: dict[str, Any] = {name: getattr(options, name) for name in names}
     choices["strain_energy"] = options.material and MATERIALS[options.material]
-    choices |= {"mixed": options.mixed or None, "contact": options.contact or None}
+    choices |= {"mixed": options.mixed or None, "contact": options.contact or None, "held": options.pin}
     choices = {name: value for name, value in choices.items() if value is not None}
     if options.mixed and options.order != 2:
         raise InputError("--mixed needs --order 2: mixed elements are quadratic")
-    if options.pin is not None and "held" not in known:
-        raise InputError(f"the {name} scene has no --pin; leave it out")
     if unknown := [choice for choice in choices if choice not in known]:
-        option = {"strain_energy": "material"}.get(unknown[0], unknown[0].replace("_", "-"))
+        option = {"strain_energy": "material", "held": "pin"}.get(unknown[0], unknown[0].replace("_", "-"))
         raise InputError(f"the {name} scene has no --{option}; leave it out")
     if options.mesh is not None and (beside := [name for name in ("cells", "dimension") if name in choices]):
         raise InputError(f"--{beside[0]} sets the scene's own mesh; leave out either it or --mesh")
@@ -82,8 +79,8 @@ def prepare(options: Arguments, name: str) -> PreparedScene:
     dt = example.dt if options.dt is None else options.dt
     seconds = example.seconds if options.seconds is None else options.seconds
     require_positive(dt=dt, seconds=seconds)
-    if not dt <= seconds < math.inf:
-        raise InputError(f"--seconds is {seconds} and --dt {dt}; expected a finite duration of at least one time step")
+    if dt > seconds:
+        raise InputError(f"--seconds is {seconds} and --dt {dt}; expected a duration of at least one time step")
     steps = round(seconds / dt)
     require_within({"steps (--seconds / --dt)": steps})
     # Positions and velocities of every step in float64, held twice while chunks are concatenated.

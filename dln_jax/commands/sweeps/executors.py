@@ -52,7 +52,7 @@ def run(
                 status = status_of(job.folder)
                 if status.state in ("missing", "running"):  # the job has not stored its end
                     word = getattr(future, "state", "")  # Slurm's state, such as OUT_OF_MEMORY
-                    how = "did not start" if status.state == "missing" else "ended without a word"
+                    how = "did not start" if status.state == "missing" else "ended without a status"
                     line = f"{how} ({word})" if isinstance(word, str) and word else how
                     status = status._replace(state="killed", line=line)
                     write_json(job.folder / STATUS, status._asdict())

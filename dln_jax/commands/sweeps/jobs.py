@@ -5,7 +5,6 @@ own process; a status file in its folder records how it ended.
 """
 
 import dataclasses
-import difflib
 import itertools
 import math
 import re
@@ -24,7 +23,7 @@ from filelock import FileLock
 
 from dln_jax.files import as_type, is_file, read_json, write_json
 from dln_jax.options import CompilationCache
-from dln_jax.runs.arguments import arguments_for, pairs_of, parse
+from dln_jax.runs.arguments import arguments_for, closest, pairs_of, parse
 from dln_jax.runs.folder import CONFIG, LOCK
 from dln_jax.runs.running import INTERRUPTED
 from dln_jax.types import InputError
@@ -140,7 +139,7 @@ def status_of(folder: Path) -> Status:
     if status.attempt < 0 or not _RUN.fullmatch(status.run) or (folder / status.run).is_symlink():
         raise InputError(f"{path}: attempt {status.attempt}, run '{status.run:.60}' are not those of a job; {remedy}")
     if status.state == "done" and not any((folder / status.run).glob("*")):
-        return Status(line="its run is gone", attempt=status.attempt)
+        return Status(line="its run folder is missing", attempt=status.attempt)
     return status
 
 
@@ -220,9 +219,9 @@ def jobs_of(
     hints = get_type_hints(whole)
     types = {field.name: hints[field.name] for field in dataclasses.fields(whole)} | {"compilation_cache": bool}
     if both := [name for name in grid if name in fixed]:
-        raise InputError(f"{both[0]} is in --grid and in --fixed; leave it out of one")
+        raise InputError(f"{both[0]} is in both --grid and --fixed; leave it out of one")
     if "out" not in types:
-        raise InputError(f"{command} has no --out, so that it leaves nothing to compare; choose a command that trains")
+        raise InputError(f"{command} has no --out and leaves nothing to compare; choose a command that trains")
 
     def word(source: str, name: str, text: str) -> str:
         """The command-line word for an option's value."""
@@ -234,16 +233,17 @@ def jobs_of(
         return f"--{option}" if TRUTH[text.lower()] else f"--no-{option}"
 
     words: dict[str, dict[str, str]] = {}
+    prog = f"dln-jax {command}"
     for name, texts in {**{name: (text,) for name, text in fixed.items()}, **grid}.items():
         source = "--grid" if name in grid else "--fixed"
         if name in OF_SWEEPS:
             raise InputError(f"{source} has {name}, which every job gets from the sweep; leave it out")
         if name not in types:
-            like = closest(name, list(types))
-            raise InputError(f"{source}: {command} has no option {name}{like} (see {command} --help)")
+            raise InputError(
+                f"{source}: {command} has no option {name}{closest(name, list(types))} (see {prog} --help)"
+            )
         words[name] = {text: word(source, name, text) for text in texts}
     first = {name: next(iter(by_text.values())) for name, by_text in words.items()}
-    prog = f"python -m dln_jax {command}"
     for name, texts in words.items():
         # Parsing takes milliseconds, so that one whole number is checked for all.
         for text in {"0" if text.isdecimal() and len(text) < 10 else text: text for text in texts}.values():
@@ -263,9 +263,3 @@ def jobs_of(
         line = (*common, *(words[name][text] for name, text in values.items()))
         jobs.append(Job(folder / "jobs" / f"{number:04}", command, line, values, "resume" in types, Path.cwd()))
     return jobs
-
-
-def closest(word: str, known: Sequence[str]) -> str:
-    """ "; did you mean WORD?" for the known word closest to an unknown one, or nothing."""
-    like = difflib.get_close_matches(word, known, n=1)
-    return f"; did you mean {like[0]}?" if like else ""

@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from dln_jax.commands.sweeps.jobs import METRICS, Job, status_of
 from dln_jax.figures import style
 from dln_jax.files import as_type, finite, is_file, read_json, write_bytes, write_json
-from dln_jax.runs.report import print_numbers
+from dln_jax.runs.report import print_numbers, spaced
 from dln_jax.types import InputError
 
 COMPARED = {
@@ -132,16 +132,16 @@ def problem_of(values: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
 
 
 def print_results(results: Mapping[str, Any], command: str, folder: Path) -> None:
-    """Prints all jobs, their medians, the best jobs, the jobs that are not done, and the sweep's folder.
+    """Prints all jobs, their medians, the unfinished jobs, the sweep's folder, and the best jobs.
 
-    A long sweep shows only the best jobs and the ones that are not done.
+    A long sweep shows only the best and the unfinished jobs.
     """
     rows, over, names = results["jobs"], results["over"], results["names"]
     best, missed = [row for row in rows if row["best"]], [row for row in rows if row["state"] != "done"]
     listed, title = rows, f"{command}, {len(rows)} jobs"
     if len(rows) > MOST_ROWS:
         listed = [row for row in rows if row["best"] or row["state"] != "done"][:MOST_ROWS]
-        title = f"{title} (the best, and those that are not done; all are in table.csv)"
+        title = f"{title} (the best and the unfinished; table.csv has all)"
     table = []
     for row in listed:
         numbers = {name: row["metrics"].get(name) for name in filter(None, names.values())}
@@ -160,18 +160,18 @@ def print_results(results: Mapping[str, Any], command: str, folder: Path) -> Non
         print_rows(f"medians over {', '.join(over)}, and the worst", table)
     if results["metrics"] and names["validation"] is None:
         known = ", ".join(sorted(results["metrics"]))
-        print(f"no job has a validation error: none is chosen; --metric takes one of {known}")
-    for row in best:
-        values = " ".join(f"{name}={text}" for name, text in row["values"].items())
-        print(f"best by {names['validation']}: {values}, run folder {folder / 'jobs' / row['job'] / row['run']}")
-    if best and names["error"] in COMPARED["error"]:
-        print(f"{names['error']} is of the test, and took no part in the choice")
+        print(f"no job has a validation error, so none is the best; choose a --metric from {known}")
     if missed:
         print(unfinished(rows))
         for (state, line), part in classes(missed, lambda row: (row["state"], row["line"])).items():
             print(f"  {', '.join(row['job'] for row in part)} {state}: {line}")
-        print(f"--out {folder} --resume does them again")
+        print(f"--out {folder} --resume runs them again")
     print(f"sweep: {folder}")
+    if best and names["error"] in COMPARED["error"]:
+        print(f"{names['error']} is measured on the test set and did not influence the choice")
+    for row in best:
+        values = " ".join(f"{name}={text}" for name, text in row["values"].items())
+        print(f"best by {names['validation']}: {values}, run folder {folder / 'jobs' / row['job'] / row['run']}")
 
 
 def print_rows(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -214,11 +214,6 @@ def unfinished(rows: Sequence[Mapping[str, Any]]) -> str:
 def shortened(text: str) -> str:
     """A value for a table; a path is shortened to its last part."""
     return Path(text).name
-
-
-def spaced(name: str) -> str:
-    """A metric or an option in words."""
-    return name.replace("_", " ").replace("mse", "MSE")
 
 
 def sweep_figure(results: Mapping[str, Any], at_once: int | None) -> Figure | None:

@@ -27,6 +27,18 @@ SHOWN, POINTS, LEVELS = 12, 121, 16
 """Number of runs drawn, of nodes along each side of the plane, and of contours of V."""
 RATE = 20.0
 """Integrator steps of a run per 1 / lambda."""
+LABELS = {
+    "down_": "from hanging: ",
+    "uniform_": "from anywhere: ",
+    "heavy_weak_": "heavy bodies, weak motors: ",
+    "light_strong_": "light bodies, strong motors: ",
+    "return_": "return, ",
+    "up_share": "share of starts that end upright",
+    "settled_median_seconds": "median time to settle",
+    "control_most": "largest control",
+    "value_error": "median relative error of V",
+}
+"""Words for parts of metrics' names."""
 
 
 def hinges_of(own: OwnProblem) -> list[int]:
@@ -125,10 +137,10 @@ def verdict_of(numbers: dict[str, float], count: int) -> Verdict:
     down, anywhere = numbers["down_up_share"], numbers["uniform_up_share"]
     altered = [numbers[key] for key in ("heavy_weak_up_share", "light_strong_up_share") if key in numbers]
     error = numbers.get("value_error", 0.0)
-    reason = f"{down:.0%} of {count} hanging starts end up, and {anywhere:.0%} of those anywhere at rest"
+    reason = f"{down:.0%} of {count} hanging starts and {anywhere:.0%} of starts anywhere end upright"
     if altered:
-        reason += f"; {min(altered):.0%} of the hanging ones with the worst masses and motors"
-    reason += f"; V differs from the cost of its law by {error:.1%} in the median"
+        reason += f"; {min(altered):.0%} of hanging starts with the worst masses and motors"
+    reason += f"; V differs from the cost of its law by {error:.1%} (median)"
     remedy = "train longer (--iterations) or with other --seeds, narrow the --box, or give a stronger motor"
     if not down >= FAILED:
         return Verdict("refused", reason, remedy)

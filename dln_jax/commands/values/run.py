@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from dln_jax.commands.values.evaluation import closed_loop, evaluation, value_plane, verdict_of
+from dln_jax.commands.values.evaluation import LABELS, closed_loop, evaluation, value_plane, verdict_of
 from dln_jax.commands.values.plants import file_of, of_file, of_run, problem_of, uncertain_numbers
 from dln_jax.control.optimal.fitted import Iteration, fit_values
 from dln_jax.control.optimal.own_plants import described, own_settings
@@ -26,7 +26,7 @@ from dln_jax.runs.devices import mesh_of
 from dln_jax.runs.folder import command_folder
 from dln_jax.runs.progress import progress
 from dln_jax.runs.report import Report, finish, png, rows_of
-from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.types import InputError, require_positive
 from dln_jax.zoo.run import load, save
 from dln_jax.zoo.value_functions import ValueRun, network_of, plant_of_model, save_value
 
@@ -47,12 +47,9 @@ def train(options: Any) -> None:
     """
     mesh = mesh_of(options)
     require_positive(starts=options.starts, seeds=options.seeds)
-    require_seed(options.seed, options.seeds)
     require_positive_if_given(options, ("width", "depth", "members", "iterations"))
     if not 0 <= options.robust < 1:
-        raise InputError(
-            f"robust is {options.robust}; expected a share of masses and motors of at least 0 and less than 1"
-        )
+        raise InputError(f"--robust is {options.robust}; expected a fraction of masses and motors, from 0 to below 1")
     goal = None if options.goal is None else numbers_of("--goal", options.goal)
     actuated, control = names_listed(options.actuated), positive_numbers(options, "control")
     control = control[0] if control is not None and len(control) == 1 else control
@@ -90,8 +87,7 @@ def train(options: Any) -> None:
     }
     network, seeds = network_of(problem, settings), range(options.seed, options.seed + options.seeds)
     with command_folder(options, "train_value") as folder:
-        for line in lines:
-            print(line)
+        print(*lines, sep="\n")
         print(f"{name}: {options.method}, {settings['members']} x {len(widths)} layers of {widths[0]}")
         if options.robust:
             print(f"robust against errors of {options.robust:.0%} of {' and '.join(dict.fromkeys(names))}")
@@ -149,8 +145,8 @@ def report_of(
     numbers = {**numbers, **measured}
     return Report(
         metrics={**finite(numbers), "verdict": verdict.number},
-        rows=rows_of(numbers),
-        title=f"returns from {options.starts} starts hanging, and anywhere",
+        rows=rows_of(numbers, LABELS),
+        title=f"returns from {options.starts} starts near hanging, and as many anywhere",
         verdict=verdict,
         figures={"value.png": png(value_plane, run), "closed-loop.png": png(closed_loop, run)},
         chosen={"plant": run.name},

@@ -138,7 +138,7 @@ def compare(
         if (nmse <= EXACT).all():
             ended = f"{trial.candidate} is exact"
         elif np.all((nmse >= LEAST_NOISE * share) & (nmse <= MOST_NOISE * share)):
-            ended = f"the errors of {trial.candidate} are the noise of the torques"
+            ended = f"the errors of {trial.candidate} are as small as the torque noise"
         return bool(ended)
 
     def rule(trials: Sequence[Trial]) -> Trial:
@@ -151,7 +151,8 @@ def compare(
     )
     left = list(candidates)[len(trials) :]
     if left and not ended:
-        ended = f"time is out; not tried: {', '.join(left)}"
+        seconds = sum(row["seconds"] for row in rows.values())
+        ended = f"time is up after {seconds:.0f} s; {', '.join(left)} not tried"
     return chosen, list(rows.values()), ended
 
 

@@ -137,7 +137,7 @@ def fit_tree(
             searched = search(structure, program, some, scale, wanted, until=until, before=searched)
             descents, starts = searched
             lowest = float(descents[0].at.loss)
-            report(f"{len(descents)} descents, {count_agreeing(descents)} to the lowest loss, {lowest:.3g}")
+            report(f"{count_agreeing(descents)} of {len(descents)} starts reached the lowest loss, {lowest:.3g}")
             finalists = _finalists(descents, validation)
             candidates = [finished(descent) for descent in finalists]
             errors = [float(np.sum(judged / scale**2)) for *_, judged in candidates]
@@ -150,7 +150,7 @@ def fit_tree(
                 other, *_, of_other = finished(nearest)
                 relative = float(np.sum(of_other / scale**2)) / errors[chosen]
                 twin = Twin(relative, difference(state.frames, other.frames, structure))
-                report(f"two descents to this tree's loss found {twin.words}")
+                report(f"The two best starts {twin.words}.")
             if (twin is not None and twin.same) or starts >= settings.starts or time.perf_counter() > until:
                 break
             # Always run one more wave of starts.

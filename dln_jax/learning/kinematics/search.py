@@ -171,9 +171,9 @@ class Twin(NamedTuple):
     @property
     def words(self) -> str:
         """The comparison as text."""
-        kind = "the same arm" if self.same else "another arm"
+        kind = "agree" if self.same else "differ"
         angle, length = np.degrees(self.off.angle), 1e3 * self.off.length
-        return f"{kind} (axes within {angle:.2g}° and {length:.2g} mm, error {self.error:.3g} times)"
+        return f"{kind}: axes within {angle:.2g}°, {length:.2g} mm, ratio of their errors {self.error:.3g}"
 
 
 def difference(first: Frames, second: Frames, structure: Structure) -> Difference:

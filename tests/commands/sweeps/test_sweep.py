@@ -89,7 +89,7 @@ def test_a_resumed_sweep_runs_only_unfinished_jobs(tmp_path, executor, capfd):
     results = json_of(out / "sweep.json")
     states = [job["state"] for job in results["jobs"]]
     assert states == ["done", "killed", *["done"] * 5, "failed", "done"]
-    assert "0001 killed: ended without a word (OUT_OF_MEMORY)" in text
+    assert "0001 killed: ended without a status (OUT_OF_MEMORY)" in text
     assert "0007 failed: the loss stopped being finite" in text
     assert (out / "sweep.png").read_bytes().startswith(b"\x89PNG")
     # The job with the best validation error has the worst test error.
@@ -116,7 +116,7 @@ def test_a_resumed_sweep_runs_only_unfinished_jobs(tmp_path, executor, capfd):
 def test_any_scheduler_may_run_the_lines_of_later(tmp_path, executor, capsys):
     out = tmp_path / "sweep"
     command(sweep, "--grid", "width=2,4 seed=0", "--where later --out", out)
-    assert "2 jobs, a line each" in capsys.readouterr().out and not (out / "sweep.json").exists()
+    assert "the command lines of 2 jobs" in capsys.readouterr().out and not (out / "sweep.json").exists()
     lines = (out / "jobs.sh").read_text().splitlines()
     for width, line in zip(("2", "4"), map(shlex.split, lines), strict=True):
         assert line[1:4] == ["-m", "dln_jax", "train_delan"] and f"--width={width}" in line
@@ -240,7 +240,7 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys, monkeypatch):
         "--command make_data --grid seed=0:2": "make_data",
         "--grid width=8 --over seed": "'seed' is unknown",
         "--grid width=8 --jobs 0": "jobs is 0",
-        "--grid width=8 --jobs 4 --gpus 2": "each job has one",
+        "--grid width=8 --jobs 4 --gpus 2": "each job needs its own GPU",
         "--grid width=8 --where slurm": "no sbatch on the PATH",
     }
     assert_refused(capsys, sweep, rows.items(), out=tmp_path / "sweep")

@@ -38,7 +38,7 @@ MISTAKES = {
     "figures=maybe": "expected yes or no",
     "data=nowhere.npz": "data=nowhere.npz: no such file",
     "out=a,b": "gets from the sweep",
-    "depth=1": "in --grid and in --fixed",
+    "depth=1": "in both --grid and --fixed",
 }
 
 

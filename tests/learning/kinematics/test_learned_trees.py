@@ -34,7 +34,7 @@ def test_an_arm_is_found_down_to_the_noise():
     said = []
     train, validation = (select(data, [index]) for index in range(2))
     fit = fit_tree(data.needs, train, validation, settings=SETTINGS, report=said.append, **SHARP)
-    assert fit.agreeing >= 2 and len(said) == 2 and "descents" in said[0] and "found the same arm" in said[1]
+    assert fit.agreeing >= 2 and len(said) == 2 and "starts" in said[0] and "starts agree" in said[1]
     assert fit.twin is not None and fit.twin.same
     errors = np.sqrt(fit.joint_mse)
     assert errors.min() > 0.7 * NOISE and errors.max() < 1.3 * NOISE
