@@ -64,14 +64,7 @@ def _filter(spectra: Axes, expected: Axes, choice: Choice) -> None:
     if np.isfinite(choice.cutoff):
         for axis in (spectra, expected):
             axis.axvline(choice.cutoff, color=style.VERMILLION, linewidth=1.0)
-        expected.annotate(
-            f" {choice.cutoff:.3g} Hz",
-            (choice.cutoff, 0.95),
-            xycoords=("data", "axes fraction"),
-            color=style.VERMILLION,
-            fontsize=style.SMALL,
-            va="top",
-        )
+        style.title(expected, f"{choice.cutoff:.3g} Hz", color=style.VERMILLION)
     spectra.set(xlabel="frequency, Hz", ylabel="spectrum of q, rad²/Hz")
     expected.set(xlabel="cut-off, Hz", ylabel="expected error of qdd")
     style.legend(spectra, ncols=2, handlelength=0.8, columnspacing=0.8, loc="lower left", fontsize=6.5)

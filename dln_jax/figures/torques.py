@@ -25,8 +25,6 @@ PARTS = {
 }
 MOST_JOINTS, MOST_MOTIONS, MOST_PATHS = 4, 6, 24
 """Largest numbers of joints, motions and paths shown."""
-MOST_ROWS = 3
-"""Largest number of joints below each other; more stand in two columns."""
 MOST_COLUMNS, MOST_EXCITED = 3, 8
 """Largest numbers of columns in a figure of friction, and of joints in one of excitation motions."""
 MOST_BANDS = 40
@@ -145,12 +143,13 @@ def torque_bands(
     """
     samples, x, _, breaks, (of_data, of_model), time = _on_one_axis(data, MOST_BANDS)
     error, shade, d = predicted - data.tau, style.colour(model), data.degrees_of_freedom
-    columns, cells = 1 + (d > MOST_ROWS), d + (bands is not None)
-    rows, wide = (-(-cells // 2), [1.0, 1.0]) if columns == 2 else (d, [1.9, 1.0][: cells - d + 1])
+    cells = d + (bands is not None)
+    columns = min(cells, 2)
+    rows = -(-cells // columns)
     figure = style.blank(height=0.8 + 1.55 * rows)
-    grid = figure.add_gridspec(2 * rows, len(wide), width_ratios=wide, height_ratios=[1.8, 1.0] * rows)
-    places = [divmod(joint, columns) for joint in range(d)]
-    axes = [figure.add_subplot(grid[2 * row + below, column]) for row, column in places for below in (0, 1)]
+    grid = figure.add_gridspec(2 * rows, columns, height_ratios=[1.8, 1.0] * rows)
+    panels = [grid[2 * (joint // columns) + below, joint % columns] for joint in range(d) for below in (0, 1)]
+    axes = list(map(figure.add_subplot, panels))
     names = names or [f"joint {joint + 1}" for joint in range(d)]
     style.prepare(*axes)
     for joint, (axis, below) in enumerate(zip(axes[::2], axes[1::2], strict=True)):
@@ -179,16 +178,15 @@ def torque_bands(
             side.margins(x=0.01)
             last = side is below and joint + columns >= d
             side.tick_params(axis="x", bottom=last, labelbottom=last)
+            side.set_xlabel(time if last else "")
         style.title(axis, text, loc="left", pad=3, fontsize=style.SMALL)
         axis.set_ylabel(unit)
         below.set_ylabel(f"error,\n{prefixed}")
         below.locator_params(axis="y", nbins=3)
-    for column in range(columns):
-        axes[1::2][column - columns].set_xlabel(time)
-        figure.align_ylabels(axes[2 * column :: 2 * columns] + axes[2 * column + 1 :: 2 * columns])
+    figure.align_ylabels(axes)
     style.legend_beside(figure, axes[0], columns=4)
     if bands is not None:
-        right = figure.add_subplot(grid[2 * (d // 2) : 2 * (d // 2) + 2, d % 2] if columns == 2 else grid[:, 1])
+        right = figure.add_subplot(grid[d - d % 2 : d - d % 2 + 2, d % 2])
         style.prepare(right)
         right.plot([0, 1], [0, 1], color=style.REFERENCE, linewidth=1.0)
         right.fill_between([0, 1], [-0.05, 0.95], [0.03, 1.03], color=style.REFERENCE, alpha=0.15, linewidth=0)
@@ -196,7 +194,7 @@ def torque_bands(
             right.plot(LEVELS, shares, color=style.colours_of(names)[name], linewidth=1.2, label=name)
         right.set(xlim=(0, 1), ylim=(0, 1), xlabel="level of the band", ylabel="share of samples in it")
         right.set(box_aspect=1, anchor="N")
-        style.legend(right, loc="lower right" if columns == 1 else (1.05, 0.0))
+        style.legend(right, loc=(1.05, 0.0))
     return figure
 
 

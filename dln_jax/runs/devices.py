@@ -90,13 +90,6 @@ def joined(member: Membership, options: Any, *, seconds: int = JOINING) -> Any:
     return dataclasses.replace(options, **here)
 
 
-def remedy_of(options: Any) -> str:
-    """Advice to the user after a process was lost."""
-    if not hasattr(options, "resume"):
-        return "start all processes again"
-    return f"continue from the last checkpoint in {options.out} with --resume in all processes"
-
-
 def end_at_once(code: int) -> NoReturn:
     """Ends this process at once, without JAX's own shutdown, which would wait for the other processes."""
     for stream in (sys.stdout, sys.stderr):

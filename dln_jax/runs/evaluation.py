@@ -14,7 +14,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import merged
 from dln_jax.figures.torques import force_decomposition, tip_paths, torque_bands
 from dln_jax.figures.training import training_curve
-from dln_jax.learning.engine.optimisers import Adam, name_of
+from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.fit import Fit, double
 from dln_jax.learning.linear import design, design_chunks
 from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
@@ -219,7 +219,7 @@ def figures_of(
     if training.history and fit.optimiser is not None:
         torque = fit.objective.selects_by == "torque"
         units = {} if torque else {"error": "loss (normalised)", "unit": "loss, in units of the data's spread"}
-        best = int(np.max(training.best_step))
+        best = np.max(training.best_step)
         figures["training.png"] = png(training_curve, training.history, best_step=best, **units)
     if log.tip is not None:
         figures["tip_paths.png"] = png(tip_paths, merged(parts.sets), log.tip, test=test, motions=motions, model=name)
@@ -246,7 +246,10 @@ def choices_of(fit: Fit, parts: Parts, log: Log) -> dict[str, Any]:
     """Values for config.json that the fit chose."""
     chosen = dict(fit.description)
     if fit.optimiser is not None:
-        chosen |= {"optimizer": name_of(fit.optimiser), **fit.optimiser._asdict()}
+        chosen |= {
+            "optimizer": "adam" if isinstance(fit.optimiser, Adam) else "gauss-newton",
+            **fit.optimiser._asdict(),
+        }
     if log.smoothed is not None:
         chosen["cutoff_hz"] = log.smoothed.cutoff
     if fit.objective is SCALED_TORQUE:

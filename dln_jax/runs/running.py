@@ -75,7 +75,10 @@ def run(
 
     def work(options: Any) -> None:
         nothing = contextlib.nullcontext()
-        lost = nothing if member is None else losses_named(devices.remedy_of(options))
+        remedy = "start all processes again"
+        if hasattr(options, "resume"):
+            remedy = f"continue from the last checkpoint in {options.out} with --resume in all processes"
+        lost = nothing if member is None else losses_named(remedy)
         with as_one_line(prog, options), lost, counting_from(start), heartbeat(start) if from_shell else nothing:
             main(options)
             devices.print_compilation()

@@ -21,6 +21,7 @@ from dln_jax.precision import quick_compilation
 AT_NOISE = 2.0
 """Held-out errors of a tree with unknown frames, in units of the noise variance, up to which its frames are right;
 above `FAR_FROM_NOISE` they may be wrong."""
+QUANTITIES = {"test": "torque", "validation": "validation torque"}
 
 
 def verdict_of(
@@ -54,12 +55,12 @@ def verdict_of(
         )
         for name, (part, data) in judged.items()
     }
-    verdicts = [judge(errors, names) for errors in held.values()]
+    verdicts = [judge(errors, names, quantity=QUANTITIES[part]) for part, errors in held.items()]
     if not fit.objective.of_torques:
         recording = whole.qdd if parts.blocks else None
-        pairs = judged.values()
-        accelerations = [held_out(answers["qdd"][part], data.qdd, recording=recording) for part, data in pairs]
-        verdicts += [judge(errors, names, quantity="acceleration") for errors in accelerations]
+        for part, data in judged.values():
+            errors = held_out(answers["qdd"][part], data.qdd, recording=recording)
+            verdicts.append(judge(errors, names, quantity="acceleration"))
     properties = fit.properties
     remedy = f"try another --degree, --model {'structured-hnn' if properties.canonical else 'structured-delan'}, "
     remedy += "or more varied motions"

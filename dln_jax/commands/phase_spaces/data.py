@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from dln_jax.data import schema
 from dln_jax.data.arrays import spread
@@ -78,16 +77,10 @@ class Task(NamedTuple):
     """The published energy of measured motions."""
 
 
-def real_energy(q: Array, p: Array) -> Array:
-    """The published energy of the measured pendulum, in its own units."""
-    return jnp.sum(2.4 * (1 - jnp.cos(q)) + p**2)
-
-
 # The noise of spring and pendulum has sd 0.1; their rates are noiseless and get a weight of 0.01.
 _NOISY = Weights(state=0.1, rate=0.01)
 _SPRING = Task("separable-hnn", 8, 1, 16, 1, 40, 10_000, 40, 30, _NOISY, 1, horizon=20.0)
 _PENDULUM = _SPRING._replace(trajectory_steps=50, window=15)
-_PIVOT = Needs(joints=("revolute",), friction=True)
 TASKS = {
     "spring": _SPRING,
     "pendulum": _PENDULUM,
@@ -97,8 +90,9 @@ TASKS = {
     "double-pendulum": Task("structured-hnn", 8, 2, 24, 2, 100, 4_000, horizon=5.0),
     "two-body": Task("pairwise-hnn", 8, 1, 24, 2, 60, 3_000, horizon=25.0),
     "three-body": Task("pairwise-hnn", 8, 1, 24, 2, 60, 4_000, horizon=3.0),
-    REAL: Task(
-        "separable-hnn", 4, 1, 8, 1, 40, 10_000, 40, 30, Weights(state=0.03), 1, needs=_PIVOT, energy=real_energy
+    REAL: Task("separable-hnn", 4, 1, 8, 1, 40, 10_000, 40, 30, Weights(state=0.03), 1)._replace(
+        needs=Needs(joints=("revolute",), friction=True),
+        energy=lambda q, p: jnp.sum(2.4 * (1 - jnp.cos(q)) + p**2),  # in the authors' units
     ),
     MEASURED: Task("", 8, 1, 8, 1, 60, 10_000, 60, 30, substeps=2),
 }

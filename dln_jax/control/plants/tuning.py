@@ -120,7 +120,8 @@ def tune(
     require_seed(seed)
     if seconds is not None and not seconds > HELD:
         raise InputError(f"seconds is {seconds}; expected more than {HELD:g} s, the time that a plant must stay up")
-    require_recovery(recover)
+    if recover not in RECOVERIES:
+        raise InputError(f"recover is {recover!r:.40}; choose from {', '.join(RECOVERIES)}")
     upright, estimator = upright_of(model, layout), estimator or by_differences(layout)
     seconds = max(SECONDS, FALLS / upright.scales.fall) if seconds is None else seconds
     results, refused = [], []
@@ -184,12 +185,6 @@ RECOVERIES: Mapping[str, tuple[Callable[[Upright, int], Way], ...]] = {
     "plans": (_by_repeated_plans,),
 }
 """Recovery after a push -> methods to try: swing up from hanging again, or plan from the present state."""
-
-
-def require_recovery(name: str) -> None:
-    """Raises `InputError` for a name that is not one of `RECOVERIES`."""
-    if name not in RECOVERIES:
-        raise InputError(f"recover is {name!r:.40}; choose from {', '.join(RECOVERIES)}")
 
 
 def _draws(random: np.random.Generator, count: int) -> list[dict[str, float]]:

@@ -178,11 +178,6 @@ def optimiser_named(name: str, *, precision: str, **settings: Any) -> Optimiser:
     return chosen
 
 
-def name_of(optimiser: Optimiser) -> str:
-    """Returns the name of an optimiser on the command line."""
-    return next(name for name, kind in NAMES.items() if isinstance(optimiser, kind))
-
-
 def transformation(adam: Adam) -> optax.GradientTransformation:
     """Returns AdamW with these settings, or the given rule."""
     if adam.rule is not None:
