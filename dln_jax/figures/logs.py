@@ -24,8 +24,8 @@ def log_figure(examined: Examination) -> Figure:
     if smoothed is not None and smoothed.choice is not None:
         _filter(axes[0, 0], axes[0, 1], smoothed.choice)
     else:
-        axes[0, 0].set_axis_off()
-        axes[0, 1].set_axis_off()
+        for axis in axes[0, :2]:
+            axis.set_axis_off()
     for axis in axes[1:].flat[joints:]:
         axis.set_axis_off()
     right = axes[0, 2]

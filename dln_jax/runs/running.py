@@ -75,10 +75,12 @@ def run(
 
     def work(options: Any) -> None:
         nothing = contextlib.nullcontext()
-        remedy = "start all processes again"
-        if hasattr(options, "resume"):
-            remedy = f"continue from the last checkpoint in {options.out} with --resume in all processes"
-        lost = nothing if member is None else losses_named(remedy)
+        lost = nothing
+        if member is not None:
+            remedy = "start all processes again"
+            if hasattr(options, "resume"):
+                remedy = f"continue from the last checkpoint in {options.out} with --resume in all processes"
+            lost = losses_named(remedy)
         with as_one_line(prog, options), lost, counting_from(start), heartbeat(start) if from_shell else nothing:
             main(options)
             devices.print_compilation()
