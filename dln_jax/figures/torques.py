@@ -154,13 +154,13 @@ def torque_bands(
     style.prepare(*axes)
     for joint, (axis, below) in enumerate(zip(axes[::2], axes[1::2], strict=True)):
         mean, off, text = predicted[samples, joint], error[samples, joint], names[joint]
-        largest, unit = float(np.quantile(np.abs(off), SHOWN)), style.unit_of(data, joint)
+        largest, unit = 1.5 * float(np.quantile(np.abs(off), SHOWN)), style.unit_of(data, joint)
         factor, prefixed = style.prefixed(largest, unit)
         axis.plot(x, data.tau[samples, joint], of_data, color="0.45", linewidth=2.0, markersize=4, label="measured")
         axis.plot(x, mean, of_model, color=shade, linewidth=1.3, label=model)
         axis.set_ylim(axis.get_ylim())  # whatever the width of the band
         below.plot(x, off / factor, of_model[:1], color=shade, linewidth=0.9)
-        limit = 1.5 * largest / factor or 1.0
+        limit = largest / factor or 1.0
         below.set_ylim(-limit, limit)
         if bands is not None:
             std, flags = bands
