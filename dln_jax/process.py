@@ -31,6 +31,14 @@ def in_a_word(kind: type[BaseException], error: BaseException, trace: TracebackT
         sys.__excepthook__(kind, error, trace)
 
 
+def sent_again(unraisable: Any) -> None:
+    """Replaces `sys.unraisablehook`: an interrupt within a callback of the garbage collector, which Python drops."""
+    if unraisable.exc_type is KeyboardInterrupt:
+        threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+    else:
+        sys.__unraisablehook__(unraisable)
+
+
 def is_command() -> bool:
     """Whether this process runs `dln-jax`, `python -m dln_jax` or `python -m scripts.NAME`."""
     words = sys.orig_argv
@@ -104,7 +112,7 @@ def seconds_left(until: float) -> float:
 
 
 if is_command():
-    sys.excepthook = in_a_word
+    sys.excepthook, sys.unraisablehook = in_a_word, sent_again
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:  # SIGTERM ends a command as Ctrl-C does
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     open_standard_streams()

@@ -51,10 +51,10 @@ def main(options: Arguments) -> None:
     from dln_jax.export.functions import functions_of_run
     from dln_jax.zoo.run import load
 
-    run, out = load(options.run), options.out
+    run, out, beside = load(options.run), options.out, options.run.resolve()
     if out is None:
-        names = (f"{options.run.resolve().name}-c-{number}" for number in itertools.count(1))
-        out = next(folder for name in names if not (folder := options.run.parent / name).exists())
+        names = (f"{beside.name}-c-{number}" for number in itertools.count(1))
+        out = next(folder for name in names if not (folder := beside.parent / name).exists())
     elif (out / "CMakeLists.txt").exists() and not options.overwrite:
         raise InputError(f"the folder {out} already contains an export; choose another --out, or add --overwrite")
     functions = functions_of_run(

@@ -215,14 +215,16 @@ def log_of(
     data = data._replace(needs=needs)
     findings = quick(data, robot) if check else []
     noisy = [finding.observation for finding in findings if finding.check == NOISY]
-    smoothed = None
-    if cutoff is not None or (noisy and driven):
+    smoothed, measured = None, "qd" not in data.estimated
+    if (cutoff is not None or (noisy and driven)) and not (measured and cutoff == np.inf and decimate == 1):
         try:
             smoothed = smooth(data, None if cutoff in (None, "auto") else cutoff, decimate=decimate)
         except InputError as error:
             if cutoff is not None:  # otherwise the log is too short for a filter and the finding remains
-                text = cutoff if isinstance(cutoff, str) else f"{cutoff:g}"
-                raise InputError(f"--cutoff {text}: {error}") from None
+                raise InputError(f"--cutoff {cutoff}: {error}") from None
+        else:
+            if cutoff is None and measured and smoothed.left_out:
+                smoothed = None  # recordings are worth more than smooth rates, and the finding remains
     ignored = {*settled, *(["friction"] if needs.friction or needs.joint_friction else [])}
     if smoothed is not None:
         # Splines without a filter keep the noise of q.
@@ -255,7 +257,7 @@ def preparation(data: Trajectories, smoothed: Smoothed | None) -> list[str]:
         if data.estimated:
             lines.append(f"not in the data: {', '.join(data.estimated)}; rates are raw finite differences")
         return lines
-    kept = f"{smoothed.rate / smoothed.decimate:.4g} Hz in {smoothed.parts} parts"
+    kept = f"{smoothed.rate / smoothed.decimate:.4g} Hz in {smoothed.parts} parts, {len(smoothed.data.t)} samples"
     how = "given" if smoothed.choice is None else "chosen from the spectra of q"
     lines.append(
         f"rates: q is not filtered{', its noise is small' * (smoothed.choice is not None)}; splines, {kept}"

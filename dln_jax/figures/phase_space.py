@@ -27,9 +27,8 @@ def motion_figure(
     fields: Mapping[str, Field] | None = None,
     quantity: str = "true energy",
     units: tuple[str, str, str] = ("", "", ""),
-    shown: int = 0,
 ) -> Figure:
-    """One motion as predicted by every model, over the truth, with its energy or another quantity over time below.
+    """The first motion by every model, over the truth, with its energy or another quantity over time below.
 
     With one coordinate a panel is the phase plane, with arrows if `fields` give the rates; with 2 n coordinates it
     shows the orbits of n bodies in a plane. The quantity is drawn beside its error relative to the largest true value.
@@ -38,7 +37,7 @@ def motion_figure(
     of q, of p and of the quantity, empty for none.
     """
     models = [name for name in motions if name != TRUTH]
-    truth, plane = plane_paths(motions[TRUTH], shown), motions[TRUTH].q.shape[2] == 1
+    truth, plane = plane_paths(motions[TRUTH]), motions[TRUTH].q.shape[2] == 1
     figure = style.blank(height=2.1 + 7.0 / max(len(models), 3))
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[6.6 / max(len(models), 3), 2.1])[:, 0]
     panels = above.subplots(1, len(models), sharex=True, sharey=True, squeeze=False)[0]
@@ -48,7 +47,7 @@ def motion_figure(
     for axis, name in zip(panels, models, strict=True):
         for x, y in truth:
             axis.plot(x, y, color="black", linewidth=2.2)
-        for x, y in plane_paths(motions[name], shown):
+        for x, y in plane_paths(motions[name]):
             axis.plot(x, y, color=style.colour(name), linewidth=1.2)
         if plane and fields is not None and name in fields:
             grid = np.linspace(-corner, corner, 11)
@@ -58,7 +57,7 @@ def motion_figure(
         style.title(axis, name, color=style.colour(name))
     _label(panels, plane, *units[:2])
     t = motions[TRUTH].t
-    values = {name: np.where(np.isfinite(energy[shown]), energy[shown], np.nan) for name, energy in energies.items()}
+    values = {name: np.where(np.isfinite(energy[0]), energy[0], np.nan) for name, energy in energies.items()}
     true = values[TRUTH]
     largest, finite = float(np.abs(true).max()), []
     for name, energy in values.items():
@@ -87,9 +86,9 @@ def _label(panels: np.ndarray, plane: bool, unit: str, momentum: str) -> None:
     panels[0].set_ylabel(style.with_unit("p", momentum) if plane else "y, m")
 
 
-def plane_paths(motions: Motions, shown: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Returns the curves of one motion: (q, p), or (x, y) of every body; gaps for non-finite values."""
-    q, p = motions.q[shown], motions.p[shown]
+def plane_paths(motions: Motions) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Returns the curves of the first motion: (q, p), or (x, y) of every body; gaps for non-finite values."""
+    q, p = motions.q[0], motions.p[0]
     q, p = (np.where(np.isfinite(state), state, np.nan) for state in (q, p))
     if q.shape[1] == 1:
         return [(q[:, 0], p[:, 0])]
@@ -100,13 +99,12 @@ def write_motion_gif(
     path: Path,
     motions: Mapping[str, Motions],
     *,
-    shown: int = 0,
     tail: int = 20,
     stride: int = 1,
     units: tuple[str, str] = ("", ""),
     frames_per_second: float = 20.0,
 ) -> None:
-    """Writes a GIF with one motion of every system in its own panel, over the truth in black if "truth" is among them.
+    """Writes a GIF with the first motion of every system in its own panel, over the truth in black if there is one.
 
     With one coordinate a panel is the phase plane; with 2 n coordinates it shows n bodies in a plane.
 
@@ -122,7 +120,7 @@ def write_motion_gif(
         raise InputError(f"the motions to show have these numbers of samples: {lengths}; expected one number, above 0")
     first = next(iter(motions.values()))
     t, plane = first.t, first.q.shape[2] == 1
-    curves = {name: plane_paths(moved, shown) for name, moved in motions.items()}
+    curves = {name: plane_paths(moved) for name, moved in motions.items()}
     framed = curves.get(TRUTH) or [curve for paths in curves.values() for curve in paths]
     corners = 1.2 * np.nanmax(np.abs(framed), axis=(0, 2))
     if not plane:

@@ -36,7 +36,6 @@ from dln_jax.locomotion.task import (
     EpisodeState,
     LocomotionTask,
     Walk,
-    actuation_seen,
     advance,
     beginning,
     change_of,
@@ -129,7 +128,8 @@ def make_policy(task: LocomotionTask, *, width: int = WIDTH) -> Policy:
         if task.clock_size:
             hidden += hk.Linear(width, with_bias=False, w_init=scaled(1.0), name="clock")(observation[split:])
         muscles = hk.Linear(task.muscle_count, w_init=scaled(0.1), name="muscles")
-        return change_of(actuation_seen(task, observation), jnp.tanh(muscles(jnp.tanh(hidden))))
+        actuation = observation[split - task.muscle_count : split]
+        return change_of(actuation, jnp.tanh(muscles(jnp.tanh(hidden))))
 
     transformed = hk.without_apply_rng(hk.transform(network))
     return Policy(lambda key: transformed.init(key, observe(task, beginning(task))), transformed.apply)

@@ -244,12 +244,6 @@ def change_of(actuation: Float[Array, " k"], command: Float[Array, " k"]) -> Flo
     return LARGEST_CHANGE * jnp.tanh((target - actuation) / LARGEST_CHANGE)
 
 
-def actuation_seen(task: LocomotionTask, observation: Float[Array, " o"]) -> Float[Array, " k"]:
-    """Returns the actuation contained in an observation."""
-    end = task.observation_size - task.clock_size
-    return observation[end - task.muscle_count : end]
-
-
 def params_of(task: LocomotionTask, world: World) -> Params:
     """Returns the parameters of the scene in a world."""
     terms = dict(task.scene.params.terms)

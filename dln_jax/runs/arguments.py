@@ -163,7 +163,7 @@ def _unknown(option: str, arguments: type) -> str:
             if option[:2] == "--" and negated in {field.name for field in dataclasses.fields(kind)}:
                 return f"{option} is an option of {words}; add that, or leave {option} out"
     names = [f"--{field.name.replace('_', '-')}" for kind in (arguments, *known) for field in dataclasses.fields(kind)]
-    return f"unrecognised option: {option:.80}{closest(option, names)}"
+    return f"unrecognised option: {option:.80}{closest(option, [*names, *(f'--no{name[1:]}' for name in names)])}"
 
 
 def closest(word: str, known: Sequence[str]) -> str:

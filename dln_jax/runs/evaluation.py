@@ -43,7 +43,7 @@ LABELS = {
     "inertial_mse": "inertial force MSE",
     "coriolis_mse": "Coriolis force MSE",
     "gravity_mse": "gravity force MSE",
-    "gravity_determined": "gravity known apart from friction (1: yes)",
+    "gravity_determined": "gravity is determined (1: yes)",
     "test_nmse": "torque nMSE (MSE over variance)",
     "validation_nmse": "nMSE on validation motions",
     "zero_nmse": "nMSE of predicting zero",
@@ -178,7 +178,9 @@ def bands_of(
         "coverage_95_worst_joint_share": float(shares[np.argmax(abs(shares - LEVEL))]),
         "out_of_distribution_share": float(out_of_distribution.mean()),
     }
-    return metrics, {"uncertainty.png": png(torque_bands, test, predicted, (std, out_of_distribution), model=fit.name)}
+    names = () if test.joint_names is None else test.joint_names
+    figure = png(torque_bands, test, predicted, (std, out_of_distribution), model=fit.name, names=names)
+    return metrics, {"uncertainty.png": figure}
 
 
 def bands(model: Model, parameters: Any, uncertainty: Uncertainty, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:

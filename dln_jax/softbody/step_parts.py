@@ -19,7 +19,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from dln_jax.softbody.integrators import BACKWARD_EULER, Integrator, averaged, averaged_moving
+from dln_jax.softbody.integrators import Integrator, averaged, averaged_moving
 from dln_jax.softbody.scene import (
     Growth,
     Params,
@@ -92,7 +92,7 @@ class Balanced(NamedTuple):
 def step_problem(
     scene: SoftScene,
     dt: Any,
-    integrator: Integrator = BACKWARD_EULER,
+    integrator: Integrator,
     *,
     tolerance: float = TOLERANCE,
     iterations: int = 100,

@@ -7,7 +7,6 @@ files are written beside the old ones and then renamed, the manifest last: a rea
 import hashlib
 import importlib.metadata
 import reprlib
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
 
@@ -185,13 +184,6 @@ def load_uncertainty(directory: Path) -> Uncertainty | None:
         is_leaf=lambda leaf: type(leaf) is tuple,
     )
     return load_tree(directory, UNCERTAINTY, like)
-
-
-def discard_uncertainty(directory: Path) -> None:
-    """Removes the stored uncertainty, if any."""
-    for ending in ("json", "safetensors"):
-        with suppress(OSError):
-            (directory / f"{UNCERTAINTY}.{ending}").unlink(missing_ok=True)
 
 
 def _flatten(tree: Any) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -25,8 +26,8 @@ from dln_jax.zoo.descriptions import OWN, Description, build
 from dln_jax.zoo.parameter_files import (
     MODEL,
     REMEDY,
+    UNCERTAINTY,
     VALUE,
-    discard_uncertainty,
     load_manifest,
     load_tree,
     load_uncertainty,
@@ -198,7 +199,9 @@ def save(directory: str | Path, description: Description, parameters: Parameters
     else:
         like = jax.eval_shape(build(description).init, jax.random.key(0))
     require_fitting(parameters, like)
-    discard_uncertainty(Path(directory))
+    for ending in ("json", "safetensors"):  # the uncertainty of an earlier model
+        with suppress(OSError):
+            (Path(directory) / f"{UNCERTAINTY}.{ending}").unlink(missing_ok=True)
     save_tree(Path(directory), MODEL, parameters, {"model": description})
 
 
@@ -230,7 +233,9 @@ def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, tr
         Run of trigonometric: 5 parameters, f32
     """
     directory = Path(directory)
-    description = read_description(directory)
+    description = load_manifest(directory, MODEL).get("model")
+    if not isinstance(description, dict):
+        raise InputError(f"{directory / MODEL}.json: describes no model; {REMEDY}")
     if description.get("precision") == "f64":
         require_double_precision(str(directory))
     try:
@@ -250,14 +255,6 @@ def _value_in(directory: Path, model: Any, parameters: Parameters) -> "ValueRun 
     from dln_jax.zoo.value_functions import load_value  # other runs do not need optimal control
 
     return load_value(directory, model, parameters)
-
-
-def read_description(directory: Path) -> Description:
-    """Reads the model description in a run folder; `InputError` if there is none."""
-    description = load_manifest(directory, MODEL).get("model")
-    if not isinstance(description, dict):
-        raise InputError(f"{directory / MODEL}.json: describes no model; {REMEDY}")
-    return description
 
 
 def compiled(functions: Functions, dtype: Any) -> Functions:

@@ -36,7 +36,7 @@ def test_a_bag_is_examined_beside_the_robot(place, capsys):
     said = capsys.readouterr().out
     assert "joints matched by name: panda_shoulder=fer_shoulder, panda_elbow=fer_elbow" in said
     assert "joints left out: panda_finger" in said and "100 Hz; q and qd by cubic splines" in said
-    assert "times panda_shoulder 0.5" in said
+    assert "by panda_shoulder 0.5" in said
     rows = {
         "--topics /joint_states": "no efforts in the messages",
         "--joints panda_elbow,panda_finger": "the robot's joint 'fer_shoulder' is not in the data",

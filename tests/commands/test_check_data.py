@@ -68,7 +68,7 @@ def prepared(arrays, **changes):
 def test_a_log_is_filtered_by_default_only_where_noise_matters_and_rates_are_missing(log):
     cutoff, lines, causes = prepared(log)
     assert 3 < cutoff < 30 and causes == () and "q is filtered" in lines[0]
-    qd = np.gradient(log["q"], axis=0)
+    qd = np.gradient(log["q"], axis=0) / log["t"][1]
     assert prepared(log, qd=qd)[0] == cutoff, "most robots log no qdd"
     assert prepared(log, qd=qd, qdd=log["tau"])[0] is None, "measured rates stay"
     cutoff, lines, _ = prepared(log, q=np.sin(5 * log["t"] + log["trajectory"])[:, None])
@@ -96,6 +96,6 @@ def test_errors_in_a_log_stop_a_training_unless_they_are_accepted(log, capsys):
 def test_options_that_make_no_filter_are_refused(log, capsys):
     rows = {
         "--cutoff fast": "expected Hz, a positive number, or auto",
-        "--cutoff 90": "--cutoff 90: cutoff is 90 Hz; expected less than 50 Hz",
+        "--cutoff 90": "--cutoff 90.0: cutoff is 90 Hz; expected less than 50 Hz",
     }
     assert_refused(capsys, train_delan, rows.items(), "--data log.npz", out=Path("run"))

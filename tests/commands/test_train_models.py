@@ -69,7 +69,7 @@ def test_auto_takes_gauss_newton_for_a_small_network_and_several_seeds_give_thei
     assert metrics["parameters"] == 2 * (2 * 3 + 3 + 3 + 1) + 1
     out = capsys.readouterr().out
     assert "gauss-newton (27 parameters: the normal equations take" in out
-    assert "cross-validated errors by seed, 3 folds: 0: " in out and "the best in cross-validation" in out
+    assert "cross-validated errors by seed, 3 folds: 0: " in out and "the best by cross-validation" in out
     assert suited(np.zeros(10_000), 100, 1)[0] == "adam"
 
 

@@ -72,7 +72,7 @@ class Explored(NamedTuple):
 def explore(
     plant: Plant,
     fit: Callable[[Trajectories], Dynamics],
-    exploration: Exploration = Exploration(),  # noqa: B008
+    exploration: Exploration,
     *,
     seed: int = 0,
 ) -> Explored:

@@ -20,7 +20,7 @@ from dln_jax.data.checks.channels import (
 from dln_jax.data.checks.priors import any_energy
 from dln_jax.data.checks.torques import Torques, check_degrees, check_torques, examine_torques
 from dln_jax.data.checks.tree import OnTree, compare_with_tree
-from dln_jax.data.encoders.sampling import step_of, timing, without_repeats
+from dln_jax.data.encoders.sampling import noise_of, step_of, timing, without_repeats
 from dln_jax.data.encoders.smoothing import Smoothed, smooth
 from dln_jax.data.repeated_motions import motion_numbers
 from dln_jax.data.robots import Robot
@@ -155,12 +155,13 @@ def examine(data: Trajectories, robot: Robot | None = None, *, repaired: Sequenc
 
 
 def _noise(data: Trajectories, even: Smoothed) -> list[Finding]:
-    """Reports accelerations from unfiltered differences of a noisy q."""
-    amplified = even.noise_q * (even.rate * np.sqrt(6) / 4)  # of central differences taken twice: sqrt(6) / (4 dt²)
-    share = np.max(amplified * even.rate / np.maximum(even.data.qdd.std(axis=0), np.finfo(float).tiny))
-    estimated = "qdd" in data.estimated or "qd" in data.estimated
-    noisy = estimated and np.isfinite(even.cutoff) and even.choice is not None and share >= 0.05
-    observation = f"accelerations differenced from q are {100 * share:.0f} % noise"
+    """Reports accelerations from unfiltered differences of a noisy q, or of a noisy measured qd."""
+    source, noise = "q", even.noise_q * even.rate * np.sqrt(3) / 2  # of central differences: 1 / (sqrt(2) dt)
+    if "qd" not in data.estimated:
+        source, noise = "qd", noise_of(data.qd, data.trajectory)
+    share = np.max(noise * even.rate / np.sqrt(2) / np.maximum(even.data.qdd.std(axis=0), np.finfo(float).tiny))
+    noisy = "qdd" in data.estimated and np.isfinite(even.cutoff) and even.choice is not None and share >= 0.05
+    observation = f"accelerations differenced from {source} are {100 * share:.0f} % noise"
     return findings_of(("warning", "raw-differences", noisy, observation, ESTIMATED))
 
 

@@ -1,6 +1,6 @@
 """C text of products, reductions, scattered updates and sorts; see `factorisations` for functions of matrices."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from string import Template
 
 import numpy as np
@@ -17,7 +17,7 @@ _TILE = 64
 """Number of columns summed at once; gcc allocates registers better for wide blocks."""
 _ROWS = 16
 """Largest number of rows with separate sums; more rows are a loop over rows."""
-_ORDER = Template("""
+ORDER = Template("""
 /* Places of each row's elements [rows, n] in ascending order, equal ones as they were, by merging; NaN last */
 static inline int elementary_before_$kind($c x, $c y)
 {
@@ -44,11 +44,6 @@ static void elementary_order_$kind(int rows, int n, const $c *key, long long *me
     }
 }
 """)
-
-
-def orderings(names: Collection[str]) -> str:
-    """Returns the C functions with these names for sorting by keys of a kind."""
-    return "".join(_ORDER.substitute(kind=kind, c=c) for kind, c in C_TYPES.items() if f"order_{kind}" in names)
 
 
 def dot_general(body: Body, members: list[Node]) -> None:

@@ -76,13 +76,12 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
             order.setdefault(node.region, []).append(node)
     reads = _reads(program, nodes, arrays, root, results)
     left = Counter(source for read in reads.values() for source in read)
-    return Plan(order, unrolled, arrays, root, set(used), levels, reads, left, _sines(unrolled - arrays))
-
-
-def _sines(scalars: set[Node]) -> dict[Node, Node]:
-    sines, cosines = ({(*n.args, n.region): n for n in scalars if n.op == op} for op in ("sin", "cos"))
+    sines, cosines = (
+        {(*n.args, n.region): n for n in unrolled - arrays if n.op == operation} for operation in ("sin", "cos")
+    )
     pairs = [(sines[key], cosines[key]) for key in sines.keys() & cosines.keys()]
-    return {**dict(pairs), **{cosine: sine for sine, cosine in pairs}}
+    partners = {**dict(pairs), **{cosine: sine for sine, cosine in pairs}}
+    return Plan(order, unrolled, arrays, root, set(used), levels, reads, left, partners)
 
 
 def _numbers(node: Node) -> list[int]:

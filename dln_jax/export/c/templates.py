@@ -178,7 +178,7 @@ def preamble(source: Source, name: str, text: str) -> str:
         tables.removesuffix("\n"),
         elementary.definitions(called, precision, arrays=arrays),
         operations.definitions(called, precision),
-        kernels.orderings(called),
+        *(kernels.ORDER.substitute(kind=kind, c=c) for kind, c in C_TYPES.items() if f"order_{kind}" in called),
         factorisations.definitions(on_matrices, source.suffix),
     ))  # fmt: skip
 
