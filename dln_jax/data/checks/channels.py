@@ -223,8 +223,8 @@ def _match(measured: JointSamples, derived: JointSamples, part: SampleIndex, far
     shifts, columns = np.arange(-farthest, farthest + 1), np.arange(measured.shape[1])
     inside = away_from_ends(part, farthest)
     if len(inside) < 16:
-        one, zero = np.ones(len(columns)), np.zeros(len(columns))
-        return one, zero, zero, one
+        one = np.ones(len(columns))
+        return one, 0 * one, one, one  # too few to contradict
     x = derived[inside]
     along = np.array([np.sum(measured[inside + shift] * x, axis=0) for shift in shifts])
     sizes = np.array([np.sum(measured[inside + shift] ** 2, axis=0) for shift in shifts])
@@ -273,7 +273,7 @@ def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
             remedy = f"exchange qd and qdd, or {RATE_REMEDY}"
             findings += findings_of(("error", f"{key}-exchanged", True, f"{key} is {name}, not {formula}", remedy))
             continue
-        farthest = max(2, min(round(FARTHEST * even.rate), 40, len(measured) // 8))
+        farthest = max(2, min(round(FARTHEST * even.rate), 40, int(np.bincount(part).max()) // 8))
         factor, delay, correlation, gained = _match(measured, own, part, farthest)
         alike = (np.abs(correlation) > ALIKE) & moves
         # Noise in the derived signal lowers the least-squares factor, but noise in the measured one does not. The true
