@@ -259,6 +259,7 @@ def test_an_exact_log_of_a_planar_arm_has_no_false_sign_or_delay():
     assert [finding.check for finding in examined.findings if finding.severity != "note"] == ["split"]
     assert abs(examined.torques.likely_delay) < 0.05
     assert examined.torques.viscous == pytest.approx(np.full(3, 0.2), abs=0.02)
+    assert errors({"t": t, "q": q, "qd": qd, "trajectory": np.arange(SAMPLES) // 30}) == [], "short recordings"
 
 
 def test_covariance_of_torques_is_that_of_an_energy():
