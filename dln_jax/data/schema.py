@@ -257,7 +257,7 @@ def _named_trajectories(arrays: dict[str, Any], t: np.ndarray) -> tuple[np.ndarr
     for sample in 1 + np.flatnonzero(same & (np.diff(t) <= 0))[:1]:
         raise InputError(
             f"t does not increase at sample {sample} of trajectory '{label[trajectory[sample]]}'; sort the samples by "
-            "time, and number consecutive recordings in a column 'trajectory'"
+            "time, keep one for each time, and number consecutive recordings in a column 'trajectory'"
         )
     return trajectory, label
 
