@@ -117,7 +117,7 @@ class Filtered(Checked):
 
     cutoff: Unstated[str] = None
     """Cut-off frequency of the low-pass filter on q, from which rates are derived, Hz; auto, or inf for no filter
-    (default: the rates in the file; auto if it has none and q is noisy)."""
+    (default: the rates in the file; auto if it has no qdd and differences are noisy)."""
 
 
 @dataclass(frozen=True)
