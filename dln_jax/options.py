@@ -116,8 +116,8 @@ class Filtered(Checked):
     """How to derive rates where a log has no reliable ones."""
 
     cutoff: Unstated[str] = None
-    """Cut-off of the low-pass filter on q that gives rates, Hz; auto, or inf for none (default: the file's rates; auto if
-    it has no qdd and differences are noisy)."""
+    """Cut-off of the low-pass filter on q that gives rates, Hz; auto, or inf for none (default: the file's rates; auto
+    if it has no qdd and differences are noisy)."""
 
 
 @dataclass(frozen=True)
