@@ -144,7 +144,9 @@ def in_blocks(data: Trajectories, blocks: int, *, last: float = 0.0) -> Trajecto
         parts = [*np.array_split(first, blocks), late][: blocks + (last > 0)]
         if not all(map(len, parts)):
             end = f" and its last {last:.0%}" if last else ""
-            raise InputError(f"trajectory '{label}' has {len(samples)} samples, too few for {blocks} block(s){end}; record longer ones")
+            raise InputError(
+                f"trajectory '{label}' has {len(samples)} samples, too few for {blocks} block(s){end}; record more"
+            )
         for name, part in zip(names, parts, strict=False):
             numbers[part] = len(labels)
             labels.append(f"{label}[{name}]")

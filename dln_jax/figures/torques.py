@@ -150,7 +150,7 @@ def torque_bands(
     grid = figure.add_gridspec(2 * rows, columns, height_ratios=[1.8, 1.0] * rows)
     panels = [grid[2 * (joint // columns) + below, joint % columns] for joint in range(d) for below in (0, 1)]
     axes = list(map(figure.add_subplot, panels))
-    names = names or [f"joint {joint + 1}" for joint in range(d)]
+    names = list(names) or [f"joint {joint + 1}" for joint in range(d)]
     style.prepare(*axes)
     for joint, (axis, below) in enumerate(zip(axes[::2], axes[1::2], strict=True)):
         mean, off, text = predicted[samples, joint], error[samples, joint], names[joint]
