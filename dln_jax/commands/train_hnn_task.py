@@ -1,12 +1,10 @@
 """Train a Hamiltonian model on motions without forces.
 
-The model gives the rates (q, p) -> (qd, pd), and the table reports how well it predicts motions. Tasks are the
-published spring, pendulum, real-pendulum (--data), two-body and three-body; damped-spring, damped-pendulum,
-henon-heiles and double-pendulum; and measured: any --data in the npz schema with q, qd or only q, whose windows never
-cross a gap. Models: auto (the one that suits the scene), separable-hnn (T(p) + V(q)), structured-hnn, black-box-hnn,
-pairwise-hnn (bodies), polynomial-hamiltonian (one least-squares problem), phase-network (a network gives the rates) and
-helmholtz-hnn (the gradients of two networks give them, with friction). Friction is learned if the needs state it. Load
-the model with dln_jax.load.
+The model gives the rates (q, p) -> (qd, pd), and the table reports how well it predicts motions. Tasks are published or
+textbook systems; for measured, --data is any file with q, qd or only q, and windows never cross a gap. Models:
+separable-hnn is T(p) + V(q), polynomial-hamiltonian one least-squares problem, pairwise-hnn for bodies; networks give
+the rates in phase-network, gradients of two in helmholtz-hnn, with friction. Others learn friction if the needs state
+it. Load the model with dln_jax.load.
 """
 
 import functools
@@ -50,7 +48,7 @@ class Motion(Drawn, Scaled, Limited, Resumable):
     """The system that moves, the model to learn, and where the results go."""
 
     task: Annotated[str, choice((*GENERATED, *RECORDED))] = "spring"
-    """System that moves; measured stands for any --data."""
+    """System that moves; measured: your --data."""
     model: Literal[
         "auto",
         "separable-hnn",
@@ -97,8 +95,7 @@ class Recorded(Checked):
     noise: Unstated[str] = None
     """Standard deviations of q, or of q and p if the file has p: one number or one each (default: estimated)."""
     order: Unstated[Literal["bodies", "axes"]] = None
-    """pairwise-hnn: order of the coordinates, x1, y1, x2, y2 or x1, x2, y1, y2 (default: the order that balances the
-    forces)."""
+    """pairwise-hnn: order x1, y1, x2, y2 or x1, x2, y1, y2 (default: the one that balances the forces)."""
 
 
 @dataclass(frozen=True)
