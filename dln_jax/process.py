@@ -31,7 +31,7 @@ def in_a_word(kind: type[BaseException], error: BaseException, trace: TracebackT
         sys.__excepthook__(kind, error, trace)
 
 
-def sent_again(unraisable: Any) -> None:
+def resend_interrupt(unraisable: Any) -> None:
     """Replaces `sys.unraisablehook`: an interrupt within a callback of the garbage collector, which Python drops."""
     if unraisable.exc_type is KeyboardInterrupt:
         threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
@@ -112,7 +112,7 @@ def seconds_left(until: float) -> float:
 
 
 if is_command():
-    sys.excepthook, sys.unraisablehook = in_a_word, sent_again
+    sys.excepthook, sys.unraisablehook = in_a_word, resend_interrupt
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:  # SIGTERM ends a command as Ctrl-C does
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     open_standard_streams()

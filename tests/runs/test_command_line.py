@@ -117,6 +117,29 @@ def test_an_interrupt_during_imports_is_one_word(tmp_path):
         assert said == "interrupted\n" and child.returncode in (-signal.SIGINT, 130)
 
 
+COLLECTED = """
+import gc, signal, sys, time
+from dln_jax.process import resend_interrupt
+
+def interrupt(*_):
+    gc.callbacks.clear()
+    raise KeyboardInterrupt
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.unraisablehook = resend_interrupt
+gc.callbacks.append(interrupt)
+gc.collect()
+try:
+    time.sleep(60)
+except KeyboardInterrupt:
+    sys.exit(7)
+"""
+
+
+def test_an_interrupt_that_the_garbage_collector_swallows_is_sent_again():
+    assert subprocess.run([sys.executable, "-c", COLLECTED]).returncode == 7
+
+
 ENDLESS = """
 import dataclasses
 import jax

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 from calls import one_line
+from compilers import needs_compiler
 from numpy.testing import assert_allclose
 
 from dln_jax import Needs, build, describe, load_c
@@ -78,7 +79,7 @@ def test_what_is_damaged_or_does_not_fit_is_refused(folder, tmp_path_factory):
         load(folder)
 
 
-@pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="there is no C compiler on the PATH")
+@needs_compiler
 def test_c_is_equal(folder, tmp_path):
     for precision, dtype, tolerance, undetermined in (("f64", float, 1e-11, 0), ("f32", np.float32, 1e-4, 3)):
         run, out = load_with(folder, known(undetermined)), tmp_path / precision

@@ -8,7 +8,8 @@ import inspect
 import jax
 import jax.numpy as jnp
 import numpy as np
-from comparison import BOUND, TYPES, in_c, in_jax, needs_compiler
+from comparison import BOUND, TYPES, in_c, in_jax
+from compilers import needs_compiler
 from conftest import slow_among
 from jax import lax
 from planar_arm import ARM

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
-from comparison import STRICT, TYPES, needs_compiler
+from comparison import STRICT, TYPES
+from compilers import needs_compiler
 
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
-from comparison import STRICT, in_order, needs_compiler
+from comparison import STRICT, in_order
+from compilers import needs_compiler
 
 from dln_jax.export.c import casadi as external_c
 from dln_jax.export.c.body import Source

@@ -8,7 +8,8 @@ import re
 import comparison
 import numpy as np
 import pytest
-from comparison import needs_compiler, needs_gcc
+from comparison import needs_gcc
+from compilers import needs_compiler
 
 from dln_jax.export.c.elementary import VECTORISED, definitions
 from dln_jax.export.c.load import FLAGS, compile_c

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from calls import one_line
-from comparison import STRICT, files_of, needs_compiler
+from comparison import STRICT, files_of
+from compilers import needs_compiler
 from jax import lax
 from sanitized import SANITIZERS
 

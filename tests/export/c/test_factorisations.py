@@ -2,7 +2,8 @@
 
 import jax.numpy as jnp
 import numpy as np
-from comparison import in_c, needs_compiler
+from comparison import in_c
+from compilers import needs_compiler
 from jax import lax
 
 N = 6

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from comparison import files_of, needs_compiler
+from comparison import files_of
+from compilers import needs_compiler
 
 from dln_jax.export.c import lowering
 from dln_jax.export.c.load import load_c

@@ -4,7 +4,7 @@ import ctypes
 
 import jax.numpy as jnp
 import numpy as np
-from comparison import needs_compiler
+from compilers import needs_compiler
 
 from dln_jax.export.c.load import STANDARD, compile_c
 from dln_jax.export.c.source import export_c

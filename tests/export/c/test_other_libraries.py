@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 import optimistix
 import pytest
-from comparison import in_c, in_jax, needs_compiler
+from comparison import in_c, in_jax
+from compilers import needs_compiler
 from sanitized import in_sanitized_c
 
 pytestmark = needs_compiler

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from comparison import BOUND, in_c, in_jax, needs_compiler
+from comparison import BOUND, in_c, in_jax
+from compilers import needs_compiler
 from conftest import slow_among
 from jax import lax
 from jax.extend.core import primitives as of_jax

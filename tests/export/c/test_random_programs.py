@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import random_programs
-from comparison import files_of, needs_compiler
+from comparison import files_of
+from compilers import needs_compiler
 from conftest import slow_among
 from sanitized import in_sanitized_c
 

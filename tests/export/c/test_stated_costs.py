@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from comparison import needs_compiler, needs_gcc
+from comparison import needs_gcc
+from compilers import needs_compiler
 from conftest import slow_among
 from jax import lax
 

@@ -5,7 +5,8 @@ import json
 import jax
 import jax.numpy as jnp
 import numpy as np
-from comparison import files_of, in_c, in_jax, needs_compiler
+from comparison import files_of, in_c, in_jax
+from compilers import needs_compiler
 from jax import lax
 
 from dln_jax.export.c.load import load_c

@@ -1,11 +1,9 @@
 """Timing of exported C: its program by a clock of known pace, and rivals that compute the same numbers."""
 
-import shutil
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
+from compilers import needs_compiler
 from numpy.testing import assert_allclose
 
 from dln_jax import dynamics, export_c
@@ -17,9 +15,6 @@ from scripts.reports.speed import exported_c
 from scripts.reports.speed.exported_c import STEP, compiled, evicting, programs, timed
 from scripts.reports.speed.networks import by_full_hessian
 
-needs_compiler = pytest.mark.skipif(
-    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="there is no C compiler on the PATH"
-)
 CLOCK = """
 #define _POSIX_C_SOURCE 199309L
 #include <time.h>

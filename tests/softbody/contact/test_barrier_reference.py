@@ -1,5 +1,6 @@
 """Barrier energies against those of the authors' toolkit, ipctk."""
 
+import ipctk
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +12,6 @@ from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.terms.term import Context
 from dln_jax.solvers.elements.moving import lists_between, moving_gradient, moving_hessians
-
-ipctk = pytest.importorskip("ipctk", reason="the reference needs ipctk, of the extra [test]")
 
 DISTANCE = 0.35
 
