@@ -58,5 +58,5 @@ def one_line(words=None):
 
 
 def json_of(path):
-    """What a JSON file holds."""
+    """Returns the contents of a JSON file."""
     return json.loads(path.read_text())

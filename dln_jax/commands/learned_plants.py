@@ -268,7 +268,7 @@ def learn_to_swing_up(
     B = layout.actuation
     process = from_log(fitted.dynamics, recording, actuation=B, delay=prepared.delay)
     band = np.asarray(process.disturbance)
-    # What the model does not explain of the driven joints acts as noise of the motors in the trials.
+    # The trials add the unexplained torque of the driven joints as motor noise.
     hardware = Hardware(encoder_noise=noise, control_noise=np.linalg.pinv(B) @ band, delay=int(prepared.delay))
     unexplained = np.max(np.atleast_1d(hardware.control_noise) / (np.ptp(layout.limits.control, axis=1) / 2))
     say(

@@ -18,7 +18,7 @@ from dln_jax.runs.folder import write_config
 
 
 class Report(NamedTuple):
-    """What a run found."""
+    """Results of a run."""
 
     metrics: Mapping[str, float | int]
     """Contents of metrics.json."""

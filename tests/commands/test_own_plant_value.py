@@ -33,8 +33,8 @@ def rod(tmp_path):
 
 @pytest.fixture
 def brief(monkeypatch):
-    """Iterations of a moment."""
-    # What earlier tests of the process have traced in float64 may hold indices of 64 bits.
+    """Shortens the iterations."""
+    # Programs that earlier tests traced in float64 may hold 64-bit indices.
     jax.clear_caches()
     short = {"starts": 16, "steps": 4, "seconds": 0.2, "batch": 16}
     monkeypatch.setattr("dln_jax.control.optimal.own_plants.Iteration", lambda **sizes: Iteration(**sizes | short))

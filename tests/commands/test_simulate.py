@@ -53,7 +53,7 @@ def test_the_beam_falls_and_its_energies_add_up():
     stored = [float(potential(scene, x[i], scene.params)) for i in (0, -1)]
     assert energies["total"][[0, -1]] == pytest.approx(kinetic[[0, -1]] + stored, rel=1e-12)
     assert energies["gravity"] == pytest.approx(9.81 * x[:, :, 1] @ masses, rel=1e-12)
-    assert (np.diff(energies["total"]) < 0).all()  # What the implicit step damps.
+    assert (np.diff(energies["total"]) < 0).all()  # The implicit step damps.
 
 
 def test_the_disc_bounces_and_hardly_sinks_in():

@@ -104,7 +104,7 @@ def test_relu_is_told_that_its_hessian_is_useless(workplace, capsys):
     out = capsys.readouterr().out
     assert "Hessian is zero almost everywhere" in out and "teaches it nothing" in out
     assert names_in(workplace / "run") == FILES
-    # What predicting zero gets: the mean of sin² over the grid.
+    # The error of predicting zero: the mean of sin² over the grid.
     assert json_of(workplace / "run/metrics.json")["hessian_mse"] == pytest.approx(
         np.mean(functions.published_grid("sin").d2y ** 2)
     )

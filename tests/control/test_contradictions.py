@@ -50,5 +50,5 @@ def test_contradictions_are_found_while_a_caller_traces():
         jax.eval_shape(lambda x: traced(x, 1.0), np.zeros(2))
     with one_line("the start violates the upper limit of state 0 at knot 0 by 0.4"):
         jax.eval_shape(lambda: traced(np.array([1.0, 0.0]), 0.0))
-    # What is traced cannot be judged.
+    # Traced numbers cannot be checked.
     jax.eval_shape(lambda place: traced(np.zeros(2), place), 1.0)

@@ -147,7 +147,7 @@ def test_free_swings_keep_their_energy():
 
 
 def test_angles_that_wrap_are_unwrapped_and_nothing_else_is():
-    """Of a joint that turns several times, one that swings about its stop at pi, and one that does neither."""
+    """One joint turns several times, one swings about its stop at pi, and one does neither."""
     t = np.arange(600) / 100
     true = np.stack([3 * t, np.pi + 0.3 * np.sin(4 * t), np.cos(t)], axis=1)
 

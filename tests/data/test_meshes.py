@@ -40,7 +40,7 @@ def outward_normals(vertices, facet):
 
 
 def flux(vertices, facet):
-    """Of the field x through facets, which is dim times the volume inside if all point outwards."""
+    """Returns the flux of the field x through facets: dim times the enclosed volume if all point outwards."""
     return np.sum(outward_normals(vertices, facet) * vertices[facet].mean(axis=1))
 
 
@@ -182,7 +182,7 @@ def test_overlapping_elements_are_accepted_and_named():
     ):
         mesh = make_mesh(vertices, elements)
         assert [set(row) for row in overlaps(mesh).tolist()] == [facet]
-        # What is covered on both sides is inside; what is covered on one, however often, is outside once.
+        # Facets covered on both sides are inside; facets covered on one side, however often, are outside.
         skin = [frozenset(row) for row in boundary(mesh).tolist()]
         assert len(set(skin)) == len(skin) == len(elements) * mesh.dimension + one_sided
         assert (facet in skin) == one_sided

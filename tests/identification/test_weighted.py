@@ -55,7 +55,7 @@ def test_estimates_and_their_errors_are_those_of_two_regressions_by_hand():
     errors = noise / np.sqrt(lengths)
     expected = np.append(errors, np.hypot(*errors))
     np.testing.assert_allclose(fit.standard_errors(combinations), expected, rtol=1e-6)
-    # Of residuals that follow each other nine count as one.
+    # Nine consecutive correlated residuals count as one.
     correlated = fit_weighted(equations, np.zeros(3), correlation=np.full(2, 9.0))
     np.testing.assert_allclose(correlated.standard_errors(combinations), 3 * expected, rtol=1e-6)
     assert fit.rank == 2 and np.isinf(fit.standard_errors(np.eye(3))).tolist() == [False, True, True]

@@ -26,7 +26,7 @@ TRUE = CHAIN.init(jax.random.key(0))._replace(
 SURE = 4.0
 """Number of standard errors that all of a few numbers stay within, except once in a thousand times."""
 NOISE, DT, LENGTH, WINDOW = 1e-3, 0.02, 61, 21
-# That of the true parameters, so that these are what is to be found.
+# The gauge of the true parameters, so that the fit should find exactly these.
 GAUGE = Gauge((0.0, 0.0), 1.5)
 
 
@@ -45,7 +45,7 @@ def recorded(count, *, driven=False):
 
 
 def statistics(task, parameters):
-    """What noise makes of a problem without measured velocities, in units of its standard deviation.
+    """Returns statistics of a problem without measured velocities, in units of the noise's standard deviation.
 
     Returns J [N, P] of measurements, starts eliminated; the step to the least of the squares, to first order; and
     standard errors of a converged fit, the roots of the diagonal of (JᵀJ)⁻¹, under the gauge if there is one.

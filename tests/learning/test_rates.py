@@ -61,7 +61,7 @@ def test_the_polynomial_recovers_the_pendulum(swing):
     np.testing.assert_allclose(coefficients[order[:2]], [-3, 1], rtol=1e-9)
     np.testing.assert_allclose(coefficients[order[2:]], 0, atol=1e-9)
     assert len(errors) == len(swing.test.data.t) and errors.max() < 1e-18
-    # Of d = 1 and degree 2: 1, cos, sin, cos 2q, sin 2q times 1, p, p², without the constant and what exceeds it.
+    # For d = 1 and degree 2: 1, cos, sin, cos 2q, sin 2q times 1, p, p², without the constant and higher degrees.
     assert len(coefficients) == 2 + 2 + 1 + 1 + 2
 
 

@@ -42,7 +42,7 @@ def test_rounding_of_times_adds_no_step_to_a_gap():
 
 
 def valid_time(data, frequency):
-    """Of an oscillator's prediction of one recording."""
+    """Returns the valid prediction time of an oscillator on one recording."""
     recordings = cut_recordings(data, 200, fitted=FITTED)
     options = {"fitted": FITTED, "substeps": 4, "momenta": True}
     predicted = predict_measured(oscillator(frequency), jnp.zeros(1), recordings, **options)

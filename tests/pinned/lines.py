@@ -1,4 +1,4 @@
-"""What every command gives on small data: the numbers that a change of the code must not move.
+"""Command lines on small data, and the results that a change of the code must not alter.
 
 `python -m pytest -n 0 tests/pinned --pinned` compares them with `pins.json`, and `--renew` stores them anew; a commit
 that does so says why. Another processor or JAX rounds otherwise: there, renew them before a change.
@@ -80,7 +80,7 @@ SPOILED: dict[str, Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]] = {
     "frozen": lambda log: log | {"q": np.where(np.arange(len(log["q"]))[:, None] // 20 % 9, log["q"], log["q"][0])},
     "noisy": lambda log: log | {"q": log["q"] + 0.01 * np.random.default_rng(2).normal(size=log["q"].shape)},
 }
-"""What may be wrong with a log that has the right shapes."""
+"""Faults of logs with the right shapes."""
 DAMAGED: dict[str, Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]] = {
     "without q": lambda log: {key: x for key, x in log.items() if key != "q"},
     "NaN": lambda log: log | {"q": np.where(log["t"][:, None] == 1.0, np.nan, log["q"])},
@@ -91,7 +91,7 @@ DAMAGED: dict[str, Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]] = {
     "time backwards": lambda log: log | {"t": log["t"][::-1]},
     "empty": lambda log: {key: x[:0] for key, x in log.items()},
 }
-"""What is wrong with a log that no command reads."""
+"""Faults of logs that no command accepts."""
 
 
 def make_files(folder):
@@ -148,7 +148,7 @@ def ended(capsys, script, *words):
 
 
 def measured(name, capsys):
-    """What a command line leaves in the working folder and prints."""
+    """Returns what a command line writes into the working folder and prints."""
     script, *words = shlex.split(LINES[name])
     folder = Path(name)
     found = ended(capsys, script, *words, "--out", folder)

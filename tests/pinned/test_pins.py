@@ -1,4 +1,4 @@
-"""What commands give on small data is what it was, while the upper half is rebuilt."""
+"""Commands on small data give the stored numbers, files and words."""
 
 import json
 import math

@@ -18,7 +18,7 @@ devices.LEAST_SECONDS = 0.0
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """What to compile."""
+    """Options of the compiled function."""
     size: int = 3
     """Size of the vector."""
 

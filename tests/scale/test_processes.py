@@ -34,7 +34,7 @@ LOST, JOINING = os.environ.get("LOST", ""), int(os.environ.get("JOINING", "60"))
 
 @dataclasses.dataclass(frozen=True)
 class Arguments(Resumable, Scaled):
-    """What to iterate."""
+    """Options of the iteration."""
     seed: int = 0
     """Unused."""
 

@@ -81,7 +81,7 @@ def test_columns_of_any_unit_count_and_what_is_negligible_does_not(way):
     solution = way(A, b)
     np.testing.assert_allclose(solution.x, X, rtol=1e-7)
     assert solution.rank == 4
-    # What terms leave that cancel: noise would project onto it and be divided by it.
+    # A rest of cancelling terms: noise would be projected onto it and divided by it.
     cancelled = 1e-14 * RANDOM.normal(size=(60, 1))
     noisy = b + 0.1 * RANDOM.normal(size=60)
     with_rounding = way(np.hstack([A, cancelled]), noisy, negligible=1e-12)

@@ -28,7 +28,7 @@ STATES = np.random.default_rng(2).uniform(-1, 1, (20, 3, 2))
 def known(undetermined=0):
     random = np.random.default_rng(0)
     directions = np.linalg.qr(random.normal(size=(P, P)))[0]
-    # Of states within 1 of zero about half are nearer than 0.9 in all coordinates; no deviation is above its limit.
+    # About half of the states within 1 of zero are within 0.9 in all coordinates. No deviation exceeds its limit.
     ranges, harmless = (np.zeros(6), np.full(6, 0.9)), np.zeros(2)
     domain = Domain(np.array([30.0, 50.0]), np.ones(P), directions[:, :undetermined], *ranges, harmless)
     return Uncertainty(0.05 * random.normal(size=(P, P)), np.array([0.1, 0.2]), np.array([1.0, 4.0]), domain)

@@ -107,7 +107,7 @@ def test_a_resumed_sweep_runs_only_unfinished_jobs(tmp_path, executor, capfd):
     assert {job["state"] for job in results["jobs"]} == {"done"}
     (best,) = [job for job in results["jobs"] if job["best"]]
     assert best["values"] == {"width": "2", "seed": "2"}
-    # What was begun was continued, in its folder.
+    # Jobs that had begun were continued in their folders.
     assert status_of(out / "jobs/0007")[:4] == ("done", "", 2, "run")
     command(sweep, "--out", out, "--resume")
     assert len(executor) == 11

@@ -146,7 +146,7 @@ def test_disturbance_is_found_from_logs_of_several_lengths():
 
 
 def test_curvature_of_a_measurement_counts_as_noise():
-    """Of y = a² with a ~ N(0, s²) and an unseen b, the points ±√2 s and 0 have the mean s² and the variance s⁴."""
+    """For y = a² with a ~ N(0, s²) and an unseen b, the points ±√2 s and 0 have the mean s² and the variance s⁴."""
     process = Process(lambda x, u, w: x, lambda x: x[:1] ** 2, np.zeros(0), 0.1, unscented=True)
     _, innovation = update(process, belief(jnp.zeros(2), jnp.array([0.5, 1.0])), jnp.array([0.25]))
     assert innovation.residual == pytest.approx(0.0) and innovation.variance == pytest.approx(0.1**2 + 0.5**4)

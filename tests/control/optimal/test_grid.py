@@ -81,7 +81,7 @@ def test_linear_interpolation_is_monotone_and_its_slopes_are_one_sided():
 
 @pytest.mark.slow
 def test_value_with_ridges_converges_to_what_its_policy_costs():
-    """Of a rod of 0.6 kg and 0.7 m whose motor cannot lift it; cubic interpolation did not converge."""
+    """The motor cannot lift the rod (0.6 kg, 0.7 m). Cubic interpolation did not converge here."""
     high = np.array([np.pi, 8.0])
     limit = 0.9
     inertia = 0.6 * 0.7**2 / 3

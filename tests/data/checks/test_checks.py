@@ -278,7 +278,7 @@ def test_covariance_of_torques_is_that_of_an_energy():
         return jax.jvp(jax.jacfwd(energy, 1), (q, qd), (qd, qdd))[1] - jax.jacfwd(energy)(q, qd)
 
     def covariance(energy):
-        """Of the torques [2, 2] of two states, where that of the energies is a function of both (q, qd)."""
+        """Returns the covariance [2, 2] of two states' torques; `energy` is that of the energies at both (q, qd)."""
         of_state = lambda *other: torque(lambda *state: energy(*state, *other), *states[:, 0])  # noqa: E731
         return jax.jit(lambda: torque(of_state, *others[:, 1]))()
 

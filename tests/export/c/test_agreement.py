@@ -97,7 +97,7 @@ def differences(got, expected):
             finite = np.isfinite(theirs)
             # An implicit step is NaN where its iterations do not suffice.
             assert finite[:STATES].mean() > (0.3 if "implicit" in name else 0.99), name
-            # Of what cancels exactly, round-off is left.
+            # Terms that cancel exactly leave round-off.
             scale = np.abs(theirs[:STATES][finite[:STATES]]).max(initial=0.1)
             finite &= np.isfinite(ours)
             apart = np.abs(ours[finite] - theirs[finite]) / np.maximum(scale, np.abs(theirs[finite]))

@@ -21,7 +21,7 @@ from dln_jax.export.c.source import export_c
 from dln_jax.export.functions import functions_of_system
 from dln_jax.scenes.pendulums import pendulum
 
-# What a loop leaves of each turn is kept even if nothing reads it.
+# A loop stacks a result of each turn, even if nothing reads it.
 FLAGS = ("-std=c99", "-pedantic", *STRICT, "-Wno-unused-but-set-variable")
 BOUND = 1e-12
 

@@ -56,7 +56,7 @@ def contents(folder):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Of an export."""
+    """Returns the folder of an export."""
     folder = tmp_path_factory.mktemp("exported")
     export_c(FUNCTIONS, folder)
     return folder

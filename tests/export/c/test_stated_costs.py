@@ -51,7 +51,7 @@ def test_operations_are_stated_by_kind_and_loops_count_every_iteration(tmp_path)
     assert cost.operations == 2 * 40 * 70 and cost.stack_bytes < 8 * (2 * 40 + 1) + 1600
     number = np.zeros(())
     assert cost_of(lambda x: lax.fori_loop(0, 10, lambda k, y: y * x, x), number, folder=tmp_path).multiplications == 10
-    # Of branches the dearest counts.
+    # The cost of a branch is that of its most expensive case.
     cost = cost_of(lambda x: lax.cond(x > 0, lambda: x * x * x, lambda: x + 1), number, folder=tmp_path)
     assert (cost.multiplications, cost.additions) == (2, 0)
     # The counter in the condition bounds a loop.

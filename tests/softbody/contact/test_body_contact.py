@@ -111,7 +111,7 @@ def test_a_block_pressed_onto_another_rubs_with_the_normal_forces_at_the_end_of_
 
     @jax.jit
     def forces(x):
-        """Of the barrier on every vertex, and each pair's force and normal."""
+        """Returns the barrier's force on every vertex, and the force and normal of each pair."""
         data = prepare_contacts(scene, scene.params, x)[:1]
         lists = lists_between(barrier, x, jnp.zeros_like(x), data)
         pairs = jax.vmap(normal_force)(x[lists[0].indices], barrier[0].describe(x, lists[0], data[0]))
