@@ -56,7 +56,7 @@ LEAST_SECONDS = 12.0
 SECONDS = 10.0
 """Shortest trial, s."""
 LEAST_SHARE = 0.5
-"""Smallest share of the starts that come up; with fewer the law is refused."""
+"""Smallest share of starts that must come up; below it the law is refused."""
 TURN, SLIDE = 2 * np.pi / 4096, 1e-4
 """Resolutions of the simulated encoders of revolute and prismatic joints, rad and m."""
 CUTOFFS = (1.0, 2.0)
@@ -75,13 +75,13 @@ BAND = 10.0
 """Factor that widens the filter's torque band, for model errors that a short log does not show."""
 
 NETWORKS = 3
-"""Initial parameters of a network that are tried: one of nine ended in a minimum 15,000 times as high as the others."""
+"""Number of initial networks to try: one of nine ended in a minimum 15,000 times as high as the others."""
 
 Fit = Callable[[PreparedRecording], FittedPlant]
 
 
 class Learned(NamedTuple):
-    """A plant's model and law, and the recording that they come from."""
+    """A plant's model and law, with the recording used to find them."""
 
     prepared: PreparedRecording
     fitted: FittedPlant

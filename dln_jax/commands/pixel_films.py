@@ -243,7 +243,7 @@ def raise_energy(H: Hamiltonian, q: Vector, p: Vector, wanted: Scalar) -> tuple[
 def inject_energy(
     model: ImageModel, parameters: Any, pair: Float[np.ndarray, " input"], factor: float
 ) -> tuple[np.ndarray, ...]:
-    """Predicts the motion from two frames, and as long with `factor` times the energy.
+    """Predicts the motion from two frames, then for the same time with `factor` times the energy.
 
     Returns times in s (that of the injection occurs twice), latent q and p, pairs of frames [T, input], the latent H
     above rest relative to its initial value, and the energy estimated from the frames in J.

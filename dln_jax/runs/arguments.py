@@ -72,7 +72,7 @@ class Variants(NamedTuple):
 
 
 def arguments_for(arguments: type, stated: Mapping[str, Any]) -> type:
-    """The dataclass of a command's options for the choices among them; `stated` is what was typed or stored."""
+    """Returns the dataclass of a command's options for its choices; `stated` are the options typed or stored."""
     variants: Variants | None = getattr(arguments, "VARIANTS", None)
     return arguments if variants is None else variants.chosen(stated)
 
@@ -119,7 +119,7 @@ def parse(arguments: type, *, prog: str, description: str | None, line: Sequence
 
 
 def _typed(line: Sequence[str]) -> dict[str, Any]:
-    """The options on a command line with their text; those without a value are `True`."""
+    """Returns the options on a command line with their text; options without a value are `True`."""
     typed: dict[str, Any] = {}
     for word, following in itertools.pairwise([*line, "--"]):
         if word.startswith("--"):
@@ -246,7 +246,7 @@ def numbers_of(option: str, text: str, counts: Collection[int] = (), *, positive
 
 
 def facts(options: Logged) -> dict[str, Any]:
-    """Keywords of `data.log.read_log`: facts on a file, and how to filter and check it."""
+    """Keywords of `data.log.read_log`: facts about a file, and how to filter and check it."""
     names = {"joints": names_listed(options.joints), "topics": names_listed(options.topics)}
     factor = None if options.torque_factor is None else torque_factor(options.torque_factor)
     stated = {"rate": options.rate, "units": options.units, "torque_factor": factor, **names}

@@ -1,4 +1,4 @@
-"""Commands on several devices and in several processes, of which the first prints and writes; and their cache.
+"""Commands on several devices and processes (the first process prints and writes), and the cache of programs.
 
 Compiled programs are reused between commands by JAX's persistent compilation cache. Only commands turn it on, never the
 library. Programs are stored in the user's cache folder. JAX's key contains the computation, the version of JAX, XLA's
@@ -47,7 +47,7 @@ def mesh_of(options: Any) -> Mesh | None:
 
 
 def membership_in(options: Any) -> Membership | None:
-    """How this process joins others; `None` for a single process. On a CPU, sets the number of devices.
+    """Returns the arguments for joining other processes; `None` for a single process. Sets a CPU's number of devices.
 
     Raises:
         InputError: the options or the cluster's environment variables are inconsistent, or --out is missing.
@@ -142,7 +142,7 @@ def keep_programs(wanted: bool) -> str:
 
 @functools.cache
 def compilation() -> dict[str, Any]:
-    """Totals since they were last printed, at first since the first call of this function; they are updated in place.
+    """Totals since the last print, or since the first call of this function; updated in place.
 
     `seconds` is the compilation time, including programs from the cache; `cached` is the number of these; `unkept` is
     the reason if programs are not kept.
@@ -161,7 +161,7 @@ def compilation() -> dict[str, Any]:
 
 
 def print_compilation() -> None:
-    """Prints the time of compilation since the last call, if it is counted, and was long or used the cache."""
+    """Prints the compilation time since the last call, if it is counted and long, or if the cache was used."""
     if not compilation.cache_info().currsize:
         return
     seconds, cached, unkept = compilation().values()
@@ -172,7 +172,7 @@ def print_compilation() -> None:
 
 
 def _remove_torn(folder: Path) -> None:
-    """Removes programs that a kill left half-written, without an access time: beside them JAX 0.10 stores no others."""
+    """Removes half-written programs, which lack an access time: JAX 0.10 would store no others beside them."""
     try:
         with FileLock(folder / LOCK, timeout=0):
             for program in folder.glob("*-cache"):

@@ -245,7 +245,7 @@ def table_of(metrics: dict[str, float | int], fit: Fit) -> tuple[tuple[str, ...]
 
 
 def choices_of(fit: Fit, parts: Parts, log: Log) -> dict[str, Any]:
-    """Values for config.json that the fit chose."""
+    """Values that the fit chose, for config.json."""
     chosen = dict(fit.description)
     if fit.optimiser is not None:
         chosen |= {
@@ -260,7 +260,7 @@ def choices_of(fit: Fit, parts: Parts, log: Log) -> dict[str, Any]:
 
 
 def lines_on(fit: Fit, summed: list[int]) -> Iterator[str]:
-    """Lines on the seed that is kept, forces known only in sum, and a training that ended early."""
+    """Lines that name the selected seed, forces known only in sum, and the reason of an early end."""
     if not isinstance(fit.seeds, int):
         by = "cross-validation" if fit.cross_validated else "validation"
         yield f"the run keeps seed {fit.seeds[fit.best]}, the best by {by}"

@@ -23,15 +23,15 @@ class Report(NamedTuple):
     metrics: Mapping[str, float | int]
     """Contents of metrics.json."""
     rows: Iterable[Sequence[str]]
-    """Rows of the printed table; none where lines say all."""
+    """Rows of the printed table; empty if the lines are enough."""
     title: str
     columns: tuple[str, ...] = ("quantity", "value", "unit")
     verdict: Verdict | None = None
-    """Whether the model may be used; `None` where nothing decides it."""
+    """Whether the model may be used; `None` if there is no test."""
     figures: Mapping[str, Callable[[Path], None]] = {}
-    """Functions that write figures and films to a path, by file name."""
+    """File name -> function that writes the figure or film to a path."""
     chosen: Mapping[str, Any] = {}
-    """Values for config.json that the fit chose from the arguments."""
+    """Values that the fit derived from the arguments, for config.json."""
     lines: tuple[str, ...] = ()
     """Lines below the table."""
     ended_by_user: bool = False

@@ -18,7 +18,7 @@ from dln_jax.runs.arguments import parse
 MOST_CHARACTERS = 400
 """Characters shown at either end of a long message; the middle is left out."""
 INTERRUPTED = 130
-"""Exit status after an interrupt, as shells have it."""
+"""Exit status after an interrupt, as in shells."""
 
 
 def run(

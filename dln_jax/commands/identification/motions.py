@@ -29,7 +29,7 @@ WINDOWS = (0.3, 1.0)
 FOLDS = 3
 """Inner splits, each with a third of the trajectories held out."""
 PUSH = 0.1
-"""Standard deviation of a window's constant torque error over that of a sample's, which partly averages out."""
+"""Ratio of the torque bias within a window to the noise of one sample."""
 LIGHTER, NYQUIST, STEP = 5.0, 0.4, 0.01
 """Cut-off of q for motions over that for torques, its largest share of the sampling rate, and their time step, s."""
 HORIZON, EVERY = 2.2, 0.5

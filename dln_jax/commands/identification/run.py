@@ -56,7 +56,7 @@ from dln_jax.zoo.run import save
 SETTLED = (*SPLIT, "friction", "condition")
 """Checks of a log that the robot's file and this command make unnecessary."""
 FITTED = "identified"
-"""Name of the parameters that the run keeps; the others are those of the file and of least squares."""
+"""Name of the parameters that the run keeps; the others come from the file and from least squares."""
 
 
 def run(options: Arguments) -> None:
@@ -266,7 +266,7 @@ def stated_motors(options: Arguments, d: int) -> tuple[Rows | None, tuple[Pair, 
 
 
 def predictor(model: Model) -> Predict:
-    """(parameters, data) -> torque, and friction, which is a part of it, [N, d] each; compiled once per N."""
+    """(parameters, data) -> torque [N, d], and its friction part [N, d]; compiled once per N."""
 
     def one(parameters: Parameters, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
         motion = dynamics(model.energies(parameters))
@@ -290,7 +290,7 @@ def shape_lines(description: Description) -> list[str]:
 def write_identified(
     path: Path, options: Arguments, robot: Robot, description: Description, parameters: RigidTreeParameters
 ) -> str:
-    """Writes the robot's file with the identified parameters; returns a line on what it lacks, or why there is none."""
+    """Writes the robot's file with the identified parameters; returns a line on what it omits, or why it is missing."""
     motors = description["motors"]
     armature = armature_matrix(parameters.armature, motors, pairs_of(parameters.coupling))
     tree = robot.tree._replace(inertias=np.asarray(parameters.inertias), armature=np.asarray(armature))

@@ -24,7 +24,7 @@ HEAVIER, MUCH_HEAVIER = 5.0, 50.0
 beyond the second refused. Payloads and rough files stay below; wrong units (N mm, mN m) do not. A single joint, where a
 payload counts for more, is doubtful beyond the second."""
 IMPOSSIBLE = 0.1
-"""A physically consistent robot is ruled out if its mean nMSE exceeds that of least squares by this."""
+"""A physically consistent robot is ruled out if its mean nMSE exceeds the nMSE of least squares by this."""
 SLIGHT = 1e-3
 """Torques of bodies below this fraction of those in the strongest joint are not compared."""
 COUNTS = 0.02

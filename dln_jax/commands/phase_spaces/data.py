@@ -40,7 +40,7 @@ LEAST_NOISE = 1e-6
 FREE_OF_NOISE = 1e-3
 """Below this ratio of the states' noise to their spread the bias of a fit of rates, its square, is negligible."""
 LEAST_RATE_NOISE = 0.01
-"""Lower limit of the noise of measured rates, relative to their spread, since no model has them exactly."""
+"""Lower limit of the noise of measured rates, relative to their spread, since no model predicts them exactly."""
 ANCHOR = 30.0
 """Noise of estimated momenta, in units of their spread: without any weight, a model could choose its own momentum."""
 SURVEYED = 1_500
@@ -131,7 +131,7 @@ class PhaseLog(NamedTuple):
     assumed: bool = False
     """Whether the needs are not stated, so that the data decide between candidates."""
     remarks: tuple[str, ...] = ()
-    """Lines on how the file was read, and what its check found."""
+    """Lines that state how the file was read, and the findings of its check."""
 
 
 def generate(name: str, trajectories: int | None = None) -> PhaseLog:
@@ -275,7 +275,7 @@ def split_test(
 
 
 def spreads(data: Trajectories, *keys: str) -> np.ndarray:
-    """Standard deviations of columns, 1 for those that do not vary."""
+    """Standard deviations of the columns; 1 for constant columns."""
     size = np.concatenate([spread(key, column(data, key)) for key in keys])
     return np.where(size > 0, size, 1.0)
 

@@ -71,9 +71,9 @@ class PhaseFit(NamedTuple):
     """Progress of all fits, with a continuous count of steps and seconds."""
     compile_seconds: float
     stop: str
-    """Reason for the end: "time", "not finite", or another one that is no failure."""
+    """Why the training ended: "time", "not finite", or another reason that is not a failure."""
     remark: str
-    """Sentence on a fit that was skipped or ended early; empty if neither happened."""
+    """Explains why a fit was skipped or ended early; empty otherwise."""
 
 
 def in_velocities(log: PhaseLog, description: Description) -> bool:

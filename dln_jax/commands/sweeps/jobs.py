@@ -35,12 +35,12 @@ METRICS = "metrics.json"
 """File in the run's folder with the numbers to compare."""
 SECONDS_BETWEEN_LOOKS = 0.1
 SECONDS_TO_END = 10.0
-"""Time that an interrupted command has to store its last checkpoint, before it is killed."""
+"""Time for an interrupted command to store its last checkpoint before it is killed."""
 _RUN = re.compile(r"run(-\d{1,9})?")
 """Names of the run folders that a job creates."""
 RANGE = re.compile(r"(-?\d{1,18}):(-?\d{1,18})(?::(-?\d{1,18}))?")
 NAME = re.compile(r"^(?:--)?([^=]*)")
-"""An option's name at the start of a word, after hyphens that are left out."""
+"""An option's name at the start of a word, without leading hyphens."""
 MOST_JOBS = 10_000
 EXAMPLE = "expected for example 'width=8,16 seed=0:10'"
 OF_SWEEPS = ("out", "resume", "processes", "coordinator", "process_id")
@@ -77,7 +77,7 @@ class Job(NamedTuple):
     """Working directory of the command."""
 
     def line(self, run: Path) -> list[str]:
-        """The command line that writes its run into this folder."""
+        """Returns the command line that writes the job's run into this folder."""
         return [sys.executable, "-m", "dln_jax", self.command, *self.arguments, f"--out={run}"]
 
 

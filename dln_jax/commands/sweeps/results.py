@@ -24,7 +24,7 @@ COMPARED = {
     "error": ("torque_mse", "value_mse", "rollout_mse", "torque_nmse", "down_return_mean"),
     "train_seconds": ("train_seconds", "learning_seconds", "identify_seconds"),
 }
-"""Metrics that are compared by default: of each kind, the first that the jobs have."""
+"""Metrics to compare by default: the first of each kind that the jobs have."""
 PROBLEM = [
     "creature",
     "data",
@@ -119,7 +119,7 @@ def compare(
 
 
 def classes(rows: Iterable[dict[str, Any]], key: Callable[[dict[str, Any]], Any]) -> dict[Any, list[dict[str, Any]]]:
-    """Rows by their key, in the order of the rows."""
+    """Groups rows by their key, in order."""
     groups: dict[Any, list[dict[str, Any]]] = {}
     for row in rows:
         groups.setdefault(tuple(key(row)), []).append(row)
@@ -127,7 +127,7 @@ def classes(rows: Iterable[dict[str, Any]], key: Callable[[dict[str, Any]], Any]
 
 
 def problem_of(values: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
-    """The options of a job that define its problem, with their values."""
+    """Returns the options of a job that define its problem, with their values."""
     return tuple((name, text) for name, text in values.items() if name in PROBLEM)
 
 
@@ -196,7 +196,7 @@ def write_tables(folder: Path, results: Mapping[str, Any]) -> None:
 
 
 def _cell(text: str) -> str:
-    """A text as a cell: a spreadsheet would compute one that starts as a formula and is no number."""
+    """Converts text to a cell; text that a spreadsheet would run as a formula is quoted."""
     try:
         float(text)
     except ValueError:
@@ -205,7 +205,7 @@ def _cell(text: str) -> str:
 
 
 def unfinished(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Counts of the jobs that are not done, by state; empty if all are done."""
+    """Counts unfinished jobs by state; empty if all are done."""
     states = Counter(row["state"] for row in rows if row["state"] != "done")
     counts = ", ".join(f"{count} {state}" for state, count in states.items())
     return f"{len(rows)} jobs: {counts}" if states else ""

@@ -29,7 +29,7 @@ file_of = functools.partial(plant_file, FOLDER)
 
 
 def of_file(path: Path, actuated: Sequence[str] = (), control: Any = None, goal: Any = None) -> tuple[Run, Layout, str]:
-    """The tree of rigid bodies of an MJCF or URDF file with viscous friction, its layout, and what it lacks.
+    """Returns the rigid-body tree of an MJCF or URDF file with viscous friction, its layout, and what it omits.
 
     Raises:
         InputError: raised by `read_robot` and `mujoco_plant`.
@@ -55,7 +55,7 @@ def of_file(path: Path, actuated: Sequence[str] = (), control: Any = None, goal:
 def of_run(
     folder: Path, actuated: Sequence[str] = (), control: Any = None, goal: Any = None
 ) -> tuple[Run, Layout, str]:
-    """The learned or identified model in a run folder, its layout, and nothing that it lacks.
+    """Returns the learned or identified model in a run folder, and its layout; it omits nothing.
 
     Raises:
         InputError: as for `load`; or the model has no dynamics, or lacks limits, motors or a goal.
@@ -99,7 +99,7 @@ def problem_of(run: Run, known: Layout, positions: Any = None, **wishes: Any) ->
 
 
 def uncertain_numbers(run: Run, problem: OwnProblem) -> tuple[tuple[str, ...], Callable[[Array], Field]]:
-    """Names of a plant's uncertain numbers, and factors of them -> its field.
+    """Names of a plant's uncertain numbers, and factors of these -> the plant's field.
 
     These are the strengths of the motors and, of a tree, the masses of the bodies before them.
     """
